@@ -1,0 +1,1 @@
+"""Talking-head data sets."""

@@ -1,0 +1,5 @@
+"""Speech: waveforms, features, encoders, phonemes and synthetic voices."""
+
+from meshanim.audio.waveform import Waveform
+
+__all__ = ["Waveform"]

@@ -1,0 +1,1 @@
+"""Writers: npz, glTF, video, contact sheets."""

@@ -1,0 +1,5 @@
+"""Meshes and the operators on them."""
+
+from meshanim.geometry.mesh import TriangleMesh
+
+__all__ = ["TriangleMesh"]

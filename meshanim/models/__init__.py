@@ -1,0 +1,1 @@
+"""Networks: each a thin composition of shared parts."""

@@ -1,0 +1,5 @@
+"""Animated meshes and what is done to them."""
+
+from meshanim.motion.sequence import MeshSequence
+
+__all__ = ["MeshSequence"]

@@ -1,0 +1,83 @@
+"""`MeshSequence`: an animated mesh with its frame rate, head pose and sound."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from meshanim.audio import Waveform
+from meshanim.errors import FileFormatError, OptionError, ShapeError
+from meshanim.files import written_whole
+from meshanim.geometry import TriangleMesh
+
+__all__ = ["MeshSequence"]
+
+
+@dataclass(frozen=True)
+class MeshSequence:
+    """Vertices over time, without head pose, and the pose beside them.
+
+    Parameters
+    ----------
+    vertices : (T, V, 3) float32
+        Metres, in the zero pose: the head does not turn in them.
+    fps : float
+        Frames a second.
+    mesh : TriangleMesh
+        Topology, texture coordinates, and the template as rest geometry.
+    pose : (T, 3) float32, optional
+        Head rotation a frame, axis-angle in radians about the neck joint; zeros if not given.
+    audio : Waveform, optional
+        The speech that goes with it.
+    """
+
+    vertices: Float[np.ndarray, "frames vertices 3"]
+    fps: float
+    mesh: TriangleMesh
+    pose: Float[np.ndarray, "frames 3"] | None = None
+    audio: Waveform | None = None
+
+    def __post_init__(self):
+        if self.vertices.ndim != 3 or self.vertices.shape[1:] != (self.mesh.n_vertices, 3):
+            raise ShapeError(
+                f"vertices must have shape (frames, {self.mesh.n_vertices}, 3), not {self.vertices.shape}"
+            )
+        if not self.fps > 0:
+            raise OptionError(f"fps must be positive, not {self.fps}")
+        if self.pose is None:
+            object.__setattr__(self, "pose", np.zeros((len(self.vertices), 3), np.float32))
+        elif self.pose.shape != (len(self.vertices), 3):
+            raise ShapeError(f"pose must have shape ({len(self.vertices)}, 3), not {self.pose.shape}")
+
+    def __len__(self) -> int:
+        return len(self.vertices)
+
+    @property
+    def duration(self) -> float:
+        """Seconds."""
+        return len(self.vertices) / self.fps
+
+    def save_npz(self, path: str | Path) -> None:
+        """Write keys `vertices` (T, V, 3), `faces` (F, 3), `fps`, `pose` (T, 3), `template` (V, 3)."""
+        with written_whole(path) as temporary, open(temporary, "wb") as file:
+            np.savez(
+                file,
+                vertices=self.vertices,
+                faces=self.mesh.faces.astype(np.int32),
+                fps=np.float64(self.fps),
+                pose=self.pose,
+                template=self.mesh.vertices.astype(np.float32),
+            )
+
+    @classmethod
+    def load_npz(cls, path: str | Path) -> "MeshSequence":
+        """Read what `save_npz` wrote; FileFormatError if a key is missing or the file is damaged."""
+        try:
+            with np.load(path) as archive:
+                arrays = {key: archive[key] for key in ("vertices", "faces", "fps", "pose")}
+                template = archive["template"] if "template" in archive else arrays["vertices"][0]
+        except (OSError, ValueError, KeyError, EOFError) as error:
+            raise FileFormatError(f"{path} is not a mesh sequence in npz: {error}") from error
+        mesh = TriangleMesh(template, arrays["faces"])
+        return cls(arrays["vertices"], float(arrays["fps"]), mesh, arrays["pose"])

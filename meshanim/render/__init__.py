@@ -1,0 +1,1 @@
+"""Mesh rendering on the CPU and the procedural look of the default head."""

@@ -1,0 +1,33 @@
+"""Shapes are checked while tests run: jaxtyping and beartype on the sources of the checkout."""
+
+from pathlib import Path
+
+from jaxtyping import install_import_hook
+
+install_import_hook("meshanim", "beartype.beartype")
+
+import meshanim  # noqa: E402
+
+# gaussians/ and datasets/ install as meshanim.gaussians and meshanim.datasets.
+meshanim.__path__.append(str(Path(__file__).parent.parent))
+
+import pytest  # noqa: E402
+import torch  # noqa: E402
+
+
+def pytest_collection_modifyitems(items):
+    if torch.cuda.is_available():
+        return
+    for item in items:
+        if "cuda" in item.keywords:
+            item.add_marker(pytest.mark.skip(reason="needs an NVIDIA GPU"))
+
+
+@pytest.fixture
+def tetrahedron():
+    from meshanim.geometry import TriangleMesh
+
+    return TriangleMesh(
+        [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+        [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]],
+    )
