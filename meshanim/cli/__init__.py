@@ -1,23 +1,92 @@
 """The command line: `meshanim VERB`, one file a verb."""
 
+import importlib
 import sys
+from collections.abc import Callable, Mapping
+from typing import Any
 
-from meshanim.errors import MeshanimError
+import tyro
+
+from meshanim.errors import MeshanimError, OptionError
 
 __all__ = ["main"]
 
+# A verb's module has COMMANDS: its command, or a mapping from the second word to one. A command is a function
+# of one frozen dataclass, whose docstring and field comments are the help.
+VERBS = {
+    "doctor": "what is installed, which backends work, how to get what is missing",
+}
+Command = Callable[[Any], object]
+
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run one verb; a `MeshanimError` becomes one line on standard error and exit code 2."""
-    from meshanim.cli import doctor
+    """Run one verb.
 
-    arguments = sys.argv[1:] if arguments is None else arguments
-    debug = "--debug" in arguments
-    arguments = [argument for argument in arguments if argument != "--debug"]
+    Parameters
+    ----------
+    arguments : list of str, optional
+        The words after `meshanim`; those of the process if not given.
+
+    Returns
+    -------
+    int
+        The exit code: 0, or 2 after one line on standard error if a `MeshanimError` was raised
+        (`--debug` lets it through with its traceback).
+    """
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    debug = "--debug" in words
+    if debug:
+        words.remove("--debug")
     try:
-        return doctor.run()
+        return _run(words)
     except MeshanimError as error:
         if debug:
             raise
-        print(f"meshanim: {error}", file=sys.stderr)
+        print(f"meshanim: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        return 130
+
+
+def _run(words: list[str]) -> int:
+    if not words or words[0] in ("-h", "--help"):
+        print("usage: meshanim VERB [OPTIONS]    (meshanim VERB --help says more)\n")
+        print("\n".join(f"  {verb:10s}{what}" for verb, what in VERBS.items()))
+        return 0
+    if words[0] == "--version":
+        from meshanim import __version__
+
+        print(__version__)
+        return 0
+    verb, rest = words[0], words[1:]
+    if verb not in VERBS:
+        raise OptionError(f"no verb '{verb}'; there are {', '.join(VERBS)}")
+    command = importlib.import_module(f"meshanim.cli.{verb}").COMMANDS
+    prog = f"meshanim {verb}"
+    if isinstance(command, Mapping):
+        if not rest or rest[0] in ("-h", "--help"):
+            print(f"usage: {prog} {{{','.join(command)}}} [OPTIONS]\n")
+            print("\n".join(f"  {name:16s}{_first_line(one)}" for name, one in command.items()))
+            return 0
+        if rest[0] not in command:
+            raise OptionError(f"no '{prog} {rest[0]}'; there are {', '.join(command)}")
+        prog, command, rest = f"{prog} {rest[0]}", command[rest[0]], rest[1:]
+    return _call(command, rest, prog)
+
+
+def _call(command: Command, words: list[str], prog: str) -> int:
+    try:
+        options = tyro.cli(_options_of(command), args=words, prog=prog)
+    except SystemExit as stop:  # --help, or words that do not parse; tyro has said which
+        return stop.code if isinstance(stop.code, int) else 2
+    code = command(options)
+    return code if isinstance(code, int) else 0
+
+
+def _options_of(command: Command) -> type:
+    (options,) = (hint for name, hint in command.__annotations__.items() if name != "return")
+    return options
+
+
+def _first_line(command: Command) -> str:
+    return (_options_of(command).__doc__ or "").strip().split("\n")[0]
