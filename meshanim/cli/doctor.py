@@ -49,9 +49,8 @@ def doctor(options: DoctorOptions) -> int:
     import torch
 
     print(f"meshanim {version('meshanim')}, Python {platform.python_version()}, {platform.platform()}")
-    print(
-        f"processor       {_processor()}, {os.cpu_count()} cores, torch uses {torch.get_num_threads()} threads"
-    )
+    threads = torch.get_num_threads()
+    print(f"processor       {_processor()}, {os.cpu_count()} cores, torch uses {threads} threads")
     missing = [name for name in REQUIRED if importlib.util.find_spec(name) is None]
     for name in REQUIRED:
         _line(name, name not in missing, _version(name), "pip install meshanim")
@@ -62,16 +61,10 @@ def doctor(options: DoctorOptions) -> int:
 
         _line("native", True, f"compiled kernels on {_native.instruction_set()}", "")
     except ImportError as error:
-        _line(
-            "native", False, "", f"reinstall with a C++17 compiler at hand, MESHANIM_NATIVE not 0 ({error})"
-        )
+        _line("native", False, "", f"reinstall with a C++17 compiler and MESHANIM_NATIVE not 0 ({error})")
     cuda = torch.cuda.is_available()
-    _line(
-        "cuda",
-        cuda,
-        torch.cuda.get_device_name() if cuda else "",
-        "needs an NVIDIA GPU and a CUDA build of torch",
-    )
+    card = torch.cuda.get_device_name() if cuda else ""
+    _line("cuda", cuda, card, "needs an NVIDIA GPU and a CUDA build of torch")
     print("optional")
     for name, purpose, remedy in OPTIONAL:
         _line(
