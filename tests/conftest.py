@@ -4,7 +4,7 @@ from pathlib import Path
 
 from jaxtyping import install_import_hook
 
-install_import_hook("meshanim", "beartype.beartype")
+install_import_hook("meshanim", "shape_checks.check")
 
 import meshanim  # noqa: E402
 
@@ -31,3 +31,13 @@ def tetrahedron():
         [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
         [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]],
     )
+
+
+@pytest.fixture
+def unchecked():
+    """Run without shape checks, as users do, to test the library's own errors."""
+    import jaxtyping
+
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)

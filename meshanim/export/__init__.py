@@ -1,1 +1,6 @@
-"""Writers: npz, glTF, video, contact sheets."""
+"""Writers: glTF, video, contact sheets (npz is `MeshSequence.save`)."""
+
+from meshanim.export.gltf import GltfMaterial, write_glb
+from meshanim.export.video import contact_sheet, write_png, write_video
+
+__all__ = ["GltfMaterial", "contact_sheet", "write_glb", "write_png", "write_video"]

@@ -1,5 +1,6 @@
 """`MeshSequence`: an animated mesh with its frame rate, head pose and sound."""
 
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -58,8 +59,18 @@ class MeshSequence:
         """Seconds."""
         return len(self.vertices) / self.fps
 
-    def save_npz(self, path: str | Path) -> None:
-        """Write keys `vertices` (T, V, 3), `faces` (F, 3), `fps`, `pose` (T, 3), `template` (V, 3)."""
+    def save(self, path: str | Path) -> None:
+        """Write an npz with `vertices` (T, V, 3), `faces` (F, 3), `fps`, `pose` (T, 3), `template` (V, 3).
+
+        Other formats, which need a head or a renderer, are written by `meshanim.export`.
+
+        Raises
+        ------
+        OptionError
+            If the path does not end in .npz.
+        """
+        if Path(path).suffix != ".npz":
+            raise OptionError(f"a sequence saves as .npz, not {path}; meshanim.export writes other formats")
         with written_whole(path) as temporary, open(temporary, "wb") as file:
             np.savez(
                 file,
@@ -71,13 +82,13 @@ class MeshSequence:
             )
 
     @classmethod
-    def load_npz(cls, path: str | Path) -> "MeshSequence":
-        """Read what `save_npz` wrote; FileFormatError if a key is missing or the file is damaged."""
+    def load(cls, path: str | Path) -> "MeshSequence":
+        """Read what `save` wrote; FileFormatError if a key is missing or the file is damaged."""
         try:
             with np.load(path) as archive:
                 arrays = {key: archive[key] for key in ("vertices", "faces", "fps", "pose")}
                 template = archive["template"] if "template" in archive else arrays["vertices"][0]
-        except (OSError, ValueError, KeyError, EOFError) as error:
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             raise FileFormatError(f"{path} is not a mesh sequence in npz: {error}") from error
         mesh = TriangleMesh(template, arrays["faces"])
         return cls(arrays["vertices"], float(arrays["fps"]), mesh, arrays["pose"])
