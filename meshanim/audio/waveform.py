@@ -1,11 +1,16 @@
-"""`Waveform`: mono samples and their rate."""
+"""`Waveform`: mono samples and their rate; reading and writing sound files."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+import soundfile
+import soxr
 
-__all__ = ["Waveform"]
+from meshanim.errors import FileFormatError, OptionError, ShapeError
+from meshanim.files import written_whole
+
+__all__ = ["Waveform", "load_waveform", "save_waveform"]
 
 
 @dataclass(frozen=True)
@@ -15,15 +20,115 @@ class Waveform:
     Parameters
     ----------
     samples : (T,) float32
-        Amplitudes, full scale is 1.
+        Amplitudes, full scale is 1. Any float or integer array is converted to float32 unscaled.
     rate : int
         Samples a second, Hz.
+
+    Raises
+    ------
+    ShapeError
+        If the samples are not one row of finite numbers, or none at all, or the rate is not positive.
     """
 
-    samples: Float[np.ndarray, " samples"]
+    samples: np.ndarray
     rate: int
+
+    def __post_init__(self):
+        samples = np.ascontiguousarray(self.samples, dtype=np.float32)
+        if samples.ndim != 1 or len(samples) == 0:
+            raise ShapeError(
+                f"samples have shape {samples.shape}; expected (T,) with T > 0: mix to mono first"
+            )
+        if not np.isfinite(samples).all():
+            first = int(np.argmin(np.isfinite(samples)))
+            raise ShapeError(
+                f"sample {first} is {samples[first]}; expected finite numbers: repair the recording"
+            )
+        if self.rate <= 0:
+            raise ShapeError(f"rate is {self.rate}; expected samples a second above 0")
+        object.__setattr__(self, "samples", samples)
 
     @property
     def duration(self) -> float:
         """Seconds."""
         return len(self.samples) / self.rate
+
+    def resampled(self, rate: int) -> "Waveform":
+        """The same sound at another rate, band-limited (soxr, high quality).
+
+        Parameters
+        ----------
+        rate : int
+            Samples a second, Hz.
+
+        Raises
+        ------
+        OptionError
+            If the rate is not positive.
+        """
+        if rate <= 0:
+            raise OptionError(f"rate is {rate}; expected samples a second above 0")
+        if rate == self.rate:
+            return self
+        samples = soxr.resample(self.samples, self.rate, rate, quality="HQ")
+        return Waveform(samples if len(samples) else np.zeros(1, np.float32), rate)
+
+    def levelled(self, peak: float = 0.7) -> "Waveform":
+        """The same sound scaled so that its largest amplitude is `peak`; silence stays as it is."""
+        largest = float(np.abs(self.samples).max())
+        return self if largest == 0 else Waveform(self.samples * np.float32(peak / largest), self.rate)
+
+
+def load_waveform(path: str | Path, rate: int | None = 16000) -> Waveform:
+    """Read a sound file, mix its channels to one by their mean and resample it.
+
+    Parameters
+    ----------
+    path : str or Path
+        Any format libsndfile reads: wav, flac, ogg, opus, mp3, aiff, ...
+    rate : int, optional
+        Samples a second of the result; None keeps the file's.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is missing or not a sound file.
+    ShapeError
+        If it holds no samples, or samples that are not finite.
+    OptionError
+        If the rate is not positive.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileFormatError(
+            f"{path} is not a file; expected a sound file (wav, flac, ogg, mp3): check the path"
+        )
+    try:
+        samples, file_rate = soundfile.read(path, dtype="float32", always_2d=True)
+    except (soundfile.LibsndfileError, OSError) as error:
+        reason = str(getattr(error, "error_string", error)).strip().rstrip(".")
+        raise FileFormatError(
+            f"{path} cannot be read as sound ({reason}); expected wav, flac, ogg or mp3: convert it first"
+        ) from error
+    if len(samples) == 0:
+        raise ShapeError(f"{path} holds no samples; expected at least one: record it again")
+    try:
+        waveform = Waveform(samples.mean(axis=1), int(file_rate))
+    except ShapeError as error:
+        raise ShapeError(f"{path}: {error}") from error
+    return waveform if rate is None else waveform.resampled(rate)
+
+
+def save_waveform(waveform: Waveform, path: str | Path) -> None:
+    """Write 16-bit PCM (wav or flac by the ending); amplitudes beyond full scale are clipped.
+
+    Raises
+    ------
+    FileFormatError
+        If the ending is no format of libsndfile or the folder cannot be written to.
+    """
+    path = Path(path)
+    if path.suffix[1:].upper() not in soundfile.available_formats():
+        raise FileFormatError(f"{path} ends in {path.suffix or 'nothing'!r}; expected .wav or .flac")
+    with written_whole(path) as temporary:
+        soundfile.write(temporary, np.clip(waveform.samples, -1, 1), waveform.rate, subtype="PCM_16")
