@@ -108,7 +108,7 @@ def fit_sphere(points: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def similarity(source: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Scale, rotation and translation with target = scale * rotation @ source + translation (Umeyama 1991)."""
+    """Scale, rotation, translation: target = scale * rotation @ source + translation (Umeyama 1991)."""
     source, target = np.asarray(source, float), np.asarray(target, float)
     from_mean, to_mean = source.mean(0), target.mean(0)
     left, singular, right = np.linalg.svd((target - to_mean).T @ (source - from_mean))
@@ -173,9 +173,7 @@ def make_eye_material(
     rim = smoothstep(0.50, 1.15, theta)[..., None]
     sclera = np.array([0.55, 0.495, 0.452]) * (1 - 0.55 * rim * np.array([0.12, 0.55, 0.58]))
     sclera = sclera * (1 - 0.50 * vein[..., None] * np.array([0.1, 0.8, 0.75]))
-    return EyeMaterial(
-        np.ascontiguousarray(iris, np.float32), np.ascontiguousarray(sclera, np.float32)
-    )
+    return EyeMaterial(np.ascontiguousarray(iris, np.float32), np.ascontiguousarray(sclera, np.float32))
 
 
 def _periodic(draws: np.random.Generator, harmonics: int):

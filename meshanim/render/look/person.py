@@ -157,9 +157,10 @@ class PersonParameters:
                 raise OptionError(f"{key} must lie in [{low:g}, {high:g}], not {value:g}")
         for item in fields(self):
             color = getattr(self, item.name)
-            if item.name.endswith("_color") and isinstance(color, tuple):
-                if len(color) != 3 or not all(0 <= channel <= 1 for channel in color):
-                    raise OptionError(f"{item.name} must be three sRGB numbers in [0, 1], not {color}")
+            if not item.name.endswith("_color") or not isinstance(color, tuple):
+                continue
+            if len(color) != 3 or not all(0 <= channel <= 1 for channel in color):
+                raise OptionError(f"{item.name} must be three sRGB numbers in [0, 1], not {color}")
         if self.hair not in HAIR_STYLES:
             raise OptionError(f"hair must be one of {', '.join(HAIR_STYLES)}, not '{self.hair}'")
         if self.eye_color not in EYE_COLORS:
