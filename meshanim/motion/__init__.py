@@ -1,5 +1,6 @@
 """Animated meshes and what is done to them."""
 
+from meshanim.motion.pose import pose_from_prosody, prosodic_accents, smooth_rotations
 from meshanim.motion.sequence import MeshSequence
 
-__all__ = ["MeshSequence"]
+__all__ = ["MeshSequence", "pose_from_prosody", "prosodic_accents", "smooth_rotations"]
