@@ -220,7 +220,8 @@ def _primitive(buffer, mesh, template, targets, weight, material: GltfMaterial, 
     if uv is not None:
         flipped = np.stack([uv[corners[:, 1], 0], 1 - uv[corners[:, 1], 1]], 1).astype(np.float32)
         attributes["TEXCOORD_0"] = buffer.accessor(flipped, "VEC2", ARRAY_BUFFER)
-    joints = np.tile(np.array([0, 1, 0, 0], np.uint8), (len(vertex), 1))
+    joints = np.zeros((len(vertex), 4), np.uint8)
+    joints[:, 1] = weight[vertex] > 0  # a joint without weight must be named 0
     blend = np.zeros((len(vertex), 4), np.float32)
     blend[:, 0], blend[:, 1] = 1 - weight[vertex], weight[vertex]
     attributes["JOINTS_0"] = buffer.accessor(joints, "VEC4", ARRAY_BUFFER)
