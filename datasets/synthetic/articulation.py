@@ -20,6 +20,7 @@ from meshanim.datasets.synthetic.visemes import (
     VOWELS,
 )
 from meshanim.errors import OptionError
+from meshanim.motion.idle import smoothstep
 from meshanim.motion.pose import CONTROL_RATE
 
 __all__ = ["Segment", "TimedPhoneme", "articulate", "holds", "segments"]
@@ -127,12 +128,6 @@ def holds(parts: Sequence[Segment], kinds: frozenset[str]) -> Float[np.ndarray, 
         else:
             spans.append((part.start + 0.2 * length, part.end - 0.2 * length))
     return np.array(spans, float).reshape(-1, 2)
-
-
-def smoothstep(x: np.ndarray) -> np.ndarray:
-    """Minimum-jerk step from 0 to 1 (Flash and Hogan, 1985, Eq. 3)."""
-    x = np.clip(x, 0, 1)
-    return x**3 * (10 - 15 * x + 6 * x * x)
 
 
 def envelope(

@@ -6,14 +6,12 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 
-from meshanim.datasets.synthetic.articulation import Segment, smoothstep
+from meshanim.datasets.synthetic.articulation import Segment
 from meshanim.datasets.synthetic.visemes import SILENCE
+from meshanim.motion.idle import gaze_weights, lid_closure, saccade, smoothstep
 from meshanim.motion.pose import CONTROL_RATE, wander
 
-__all__ = ["GAZE_RANGE", "blinks", "brows", "gaze"]
-
-GAZE_RANGE = 0.45
-"""Radians that an eye turns at an eyeLook weight of 1."""
+__all__ = ["blinks", "brows", "gaze"]
 
 
 def blinks(
@@ -24,8 +22,6 @@ def blinks(
     generator: np.random.Generator,
 ) -> Float[np.ndarray, " frames"]:
     """Lid closure at the given seconds: a Poisson process pulled to the beginning of pauses.
-
-    Lids close in 0.09 s, stay for 0.045 s (one frame at 24 a second or more) and open in 0.18 s.
 
     Parameters
     ----------
@@ -51,9 +47,7 @@ def blinks(
     while moment < duration:
         near = pauses[np.abs(pauses - moment) < 0.45]
         centre = near[np.argmin(np.abs(near - moment))] + 0.05 if len(near) else moment
-        closing = smoothstep((at - centre + 0.1125) / 0.09)
-        opening = smoothstep((centre + 0.2025 - at) / 0.18)
-        result = np.maximum(result, generator.uniform(0.94, 1.0) * np.minimum(closing, opening))
+        result = np.maximum(result, generator.uniform(0.94, 1.0) * lid_closure(at - centre))
         moment = max(centre, moment) + refractory + generator.exponential(max(1 / rate - refractory, 0.05))
     return result
 
@@ -101,8 +95,7 @@ def gaze(
 ) -> dict[str, Float[np.ndarray, " frames"]]:
     """Eye weights: fixations of 0.3 to 2 s near a listener in front, saccades between them.
 
-    The eyes turn against the head, so that the gaze stays where it is. Saccades last 21 ms + 2.2 ms a degree
-    (Carpenter, "Movements of the eyes", 1988).
+    The eyes turn against the head, so that the gaze stays where it is.
 
     Parameters
     ----------
@@ -126,23 +119,9 @@ def gaze(
         away = generator.random() < 0.12
         deviation = np.array([0.07, 0.14]) if away else np.array([0.018, 0.032])
         there = np.asarray(rest) + amount * generator.normal(size=2) * deviation
-        degrees = np.degrees(np.linalg.norm(there - here))
-        step = smoothstep((at - moment) / (0.021 + 0.0022 * degrees))
+        step = saccade(at - moment, float(np.linalg.norm(there - here)))
         pitch += (there[0] - here[0]) * step
         yaw += (there[1] - here[1]) * step
         here = there
         moment += float(np.clip(generator.gamma(2.2, 0.22 if away else 0.42), 0.25, 2.5))
-    pitch = (pitch - 0.85 * head[:, 0]) / GAZE_RANGE
-    yaw = (yaw - 0.85 * head[:, 1]) / GAZE_RANGE
-    left, right = np.clip(yaw, 0, 1), np.clip(-yaw, 0, 1)
-    down, up = np.clip(pitch, 0, 1), np.clip(-pitch, 0, 1)
-    return {
-        "eyeLookOutLeft": left,
-        "eyeLookInRight": left,
-        "eyeLookInLeft": right,
-        "eyeLookOutRight": right,
-        "eyeLookDownLeft": down,
-        "eyeLookDownRight": down,
-        "eyeLookUpLeft": up,
-        "eyeLookUpRight": up,
-    }
+    return gaze_weights(pitch - 0.85 * head[:, 0], yaw - 0.85 * head[:, 1])
