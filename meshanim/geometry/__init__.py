@@ -1,20 +1,35 @@
 """Meshes and the operators on them."""
 
+from meshanim.geometry.closest_points import SurfacePoints, closest_points
+from meshanim.geometry.decimation import Decimation, Prolongation, decimate, prolongation
+from meshanim.geometry.frames import TriangleFrames, triangle_frames
 from meshanim.geometry.geodesics import HeatGeodesics
 from meshanim.geometry.laplacian import cotangent_laplacian, vertex_masses
 from meshanim.geometry.mesh import TriangleMesh
 from meshanim.geometry.normals import face_normals, vertex_normals
 from meshanim.geometry.subdivision import bilinear_operator, catmull_clark_operator
+from meshanim.geometry.transfer import SparseOperator, carry, transfer_operator
 from meshanim.geometry.uv import rasterize_uv
 
 __all__ = [
+    "Decimation",
     "HeatGeodesics",
+    "Prolongation",
+    "SparseOperator",
+    "SurfacePoints",
+    "TriangleFrames",
     "TriangleMesh",
     "bilinear_operator",
+    "carry",
     "catmull_clark_operator",
+    "closest_points",
     "cotangent_laplacian",
+    "decimate",
     "face_normals",
+    "prolongation",
     "rasterize_uv",
+    "transfer_operator",
+    "triangle_frames",
     "vertex_masses",
     "vertex_normals",
 ]
