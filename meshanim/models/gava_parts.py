@@ -64,11 +64,12 @@ class SparseRows(nn.Module):
             or self._matrices[0].device != self.values.device
             or self._matrices[0].dtype != dtype
         ):
-            indices = torch.stack([self.rows, self.columns]).long()
-            values = self.values.to(dtype)
-            matrix = torch.sparse_coo_tensor(indices, values, self.shape).coalesce()
-            transpose = torch.sparse_coo_tensor(indices.flip(0), values, self.shape[::-1]).coalesce()
-            self._matrices = (matrix.to_sparse_csr(), transpose.to_sparse_csr())
+            with torch.inference_mode(False):
+                indices = torch.stack([self.rows, self.columns]).long()
+                values = self.values.to(dtype)
+                matrix = torch.sparse_coo_tensor(indices, values, self.shape).coalesce()
+                transpose = torch.sparse_coo_tensor(indices.flip(0), values, self.shape[::-1]).coalesce()
+                self._matrices = (matrix.to_sparse_csr(), transpose.to_sparse_csr())
         return self._matrices
 
     def forward(self, attributes: Float[Tensor, "batch columns width"]) -> Float[Tensor, "batch rows width"]:

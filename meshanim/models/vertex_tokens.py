@@ -153,8 +153,10 @@ class VertexTokens(nn.Module):
         """The attention pattern over the tokens, kept for each device."""
         key = (rings, self_loops, global_token, self.edges.device)
         if key not in self._graphs:
-            graph = MeshGraph.from_edges(self.edges.cpu(), self.n_tokens, rings, self_loops, global_token)
-            self._graphs[key] = graph.to(self.edges.device)
+            with torch.inference_mode(False):
+                edges = self.edges.cpu().numpy()
+                graph = MeshGraph.from_edges(edges, self.n_tokens, rings, self_loops, global_token)
+                self._graphs[key] = graph.to(self.edges.device)
         return self._graphs[key]
 
     def identity(self, templates: Float[Tensor, "subjects vertices 3"]) -> Float[Tensor, "subjects tokens 3"]:

@@ -1,0 +1,347 @@
+"""One trainer for all models, on Hugging Face Accelerate.
+
+Batches are a function of their number alone, so a run is a function of its seed: an interrupted and resumed
+run takes the same steps as one that was never interrupted.
+"""
+
+import json
+import math
+import shutil
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+import torch
+from accelerate import Accelerator
+from accelerate.utils import DistributedDataParallelKwargs
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from meshanim.errors import FileFormatError, OptionError
+from meshanim.files import written_whole
+
+__all__ = ["TrainConfig", "Trainer", "TrainingTask", "learning_rate_factor"]
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """How a model is trained; what it is trained on is the task's.
+
+    Parameters
+    ----------
+    steps : int
+        Optimiser steps of the whole run; GAVA: 70,000.
+    learning_rate : float
+        Peak of the schedule.
+    warmup : int
+        Steps of linear warm-up.
+    schedule : "constant" or "cosine"
+        After the warm-up; cosine ends at zero.
+    weight_decay : float
+        Decoupled (AdamW); 0 is the paper's Adam.
+    gradient_clip : float
+        Largest norm of the gradient; 0 for no limit.
+    accumulation : int
+        Batches an optimiser step, on each process.
+    ema : float
+        Decay of the moving average of the weights that is saved as the result; 0 for none.
+    mixed_precision : "no", "bf16" or "fp16"
+        Autocast of forward passes.
+    seed : int
+        Of everything random.
+    log_every, save_every : int
+        Steps between lines of the log, and between checkpoints.
+    keep : int
+        Checkpoints kept, the newest.
+
+    Raises
+    ------
+    OptionError
+        If a number is out of range.
+    """
+
+    steps: int = 70_000
+    learning_rate: float = 1e-4
+    warmup: int = 0
+    schedule: Literal["constant", "cosine"] = "constant"
+    weight_decay: float = 0.0
+    gradient_clip: float = 0.0
+    accumulation: int = 1
+    ema: float = 0.0
+    mixed_precision: Literal["no", "bf16", "fp16"] = "no"
+    seed: int = 0
+    log_every: int = 50
+    save_every: int = 1000
+    keep: int = 2
+
+    def __post_init__(self):
+        for name in ("steps", "accumulation", "log_every", "save_every", "keep"):
+            if getattr(self, name) < 1:
+                raise OptionError(f"{name} must be at least 1, not {getattr(self, name)}")
+        if not self.learning_rate > 0:
+            raise OptionError(f"learning_rate must be positive, not {self.learning_rate}")
+        if not 0 <= self.ema < 1:
+            raise OptionError(f"ema must be in [0, 1), not {self.ema}")
+
+
+class TrainingTask(Protocol):
+    """What a trainer needs to know of a model's data and loss."""
+
+    def batch(self, number: int) -> Mapping[str, Any]:
+        """The batch of a number: the same one whenever it is asked for. Tensors are moved to the device."""
+
+    def loss(self, model: nn.Module, batch: Mapping[str, Any]) -> tuple[Tensor, dict[str, Tensor]]:
+        """The loss of a batch, and its terms for the log."""
+
+    def save(self, model: nn.Module, directory: Path) -> None:
+        """Write the model into a folder that exists."""
+
+
+def learning_rate_factor(config: TrainConfig, step: int) -> float:
+    """Factor on the learning rate at a step, counted from 0."""
+    if step < config.warmup:
+        return (step + 1) / config.warmup
+    if config.schedule == "constant":
+        return 1.0
+    progress = (step - config.warmup) / max(config.steps - config.warmup, 1)
+    return 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
+
+
+class Trainer:
+    """Runs a task's loss to the end of its schedule, with checkpoints.
+
+    Parameters
+    ----------
+    model : nn.Module
+        What learns. Its parameters are changed in place.
+    task : TrainingTask
+        Batches and loss.
+    config : TrainConfig
+        The schedule.
+    directory : Path
+        Gets `checkpoints/STEP/`, `tensorboard/` and, at the end, `model/`.
+    cpu : bool
+        Stay on the CPU where there is a GPU.
+    find_unused : bool
+        Some parameters get no gradient (ablations); only matters with several processes.
+    """
+
+    def __init__(
+        self,
+        model: nn.Module,
+        task: TrainingTask,
+        config: TrainConfig,
+        directory: str | Path,
+        cpu: bool = False,
+        find_unused: bool = False,
+    ):
+        self.task, self.config, self.directory = task, config, Path(directory)
+        self.accelerator = Accelerator(
+            mixed_precision=config.mixed_precision,
+            gradient_accumulation_steps=config.accumulation,
+            cpu=cpu,
+            kwargs_handlers=[DistributedDataParallelKwargs(find_unused_parameters=find_unused)],
+        )
+        torch.manual_seed(config.seed)
+        optimizer = torch.optim.AdamW(
+            model.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
+        )
+        self.model, self.optimizer = self.accelerator.prepare(model, optimizer)
+        self.step = 0
+        bare = self.accelerator.unwrap_model(self.model)
+        self.average = {n: p.detach().clone() for n, p in bare.named_parameters()} if config.ema else {}
+
+    @property
+    def bare(self) -> nn.Module:
+        """The model without the wrappers of distributed training."""
+        return self.accelerator.unwrap_model(self.model)
+
+    def run(self, until: int | None = None, progress: bool = True) -> nn.Module:
+        """Train from where the run stands to the last step (or to step `until`), and save.
+
+        Returns
+        -------
+        nn.Module
+            The model; with `ema`, the averaged weights are in `directory/model`, the model keeps its own.
+
+        Raises
+        ------
+        FloatingPointError
+            If the loss is not finite.
+        """
+        config, accelerator = self.config, self.accelerator
+        last = config.steps if until is None else min(until, config.steps)
+        writer = self._writer()
+        bar = tqdm(
+            total=config.steps,
+            initial=self.step,
+            unit="step",
+            disable=not (progress and accelerator.is_main_process),
+        )
+        self.model.train()
+        while self.step < last:
+            logs = self._optimizer_step()
+            self.step += 1
+            bar.update()
+            if self.step % config.log_every == 0 or self.step == last:
+                values = {name: float(value) for name, value in logs.items()}
+                if not all(map(math.isfinite, values.values())):
+                    raise FloatingPointError(f"the loss of step {self.step} is not finite: {values}")
+                bar.set_postfix({name: f"{value:.4g}" for name, value in values.items()})
+                if writer is not None:
+                    for name, value in values.items():
+                        writer.add_scalar(name, value, self.step)
+            if self.step % config.save_every == 0 or self.step == last:
+                self.save_checkpoint()
+        bar.close()
+        if writer is not None:
+            writer.close()
+        if self.step == config.steps and accelerator.is_main_process:
+            self._save_result()
+        accelerator.wait_for_everyone()
+        return self.bare
+
+    def _optimizer_step(self) -> dict[str, Tensor]:
+        config, accelerator = self.config, self.accelerator
+        for group in self.optimizer.param_groups:
+            group["lr"] = config.learning_rate * learning_rate_factor(config, self.step)
+        logs: dict[str, Tensor] = {}
+        for part in range(config.accumulation):
+            number = (self.step * config.accumulation + part) * accelerator.num_processes
+            batch = self._to_device(self.task.batch(number + accelerator.process_index))
+            with accelerator.accumulate(self.model):
+                with accelerator.autocast():
+                    loss, terms = self.task.loss(self.model, batch)
+                accelerator.backward(loss)
+                if accelerator.sync_gradients and config.gradient_clip:
+                    accelerator.clip_grad_norm_(self.model.parameters(), config.gradient_clip)
+                self.optimizer.step()
+                self.optimizer.zero_grad()
+            for name, value in {"loss": loss, **terms}.items():
+                logs[name] = logs.get(name, 0) + value.detach() / config.accumulation
+        if self.average:
+            # The average of a young run forgets its random start sooner.
+            decay = min(config.ema, (1 + self.step) / (10 + self.step))
+            with torch.no_grad():
+                for name, parameter in self.bare.named_parameters():
+                    self.average[name].lerp_(parameter, 1 - decay)
+        return logs
+
+    def _to_device(self, batch: Mapping[str, Any]) -> dict[str, Any]:
+        device = self.accelerator.device
+        return {k: v.to(device) if isinstance(v, Tensor) else v for k, v in batch.items()}
+
+    def _writer(self):
+        if not self.accelerator.is_main_process:
+            return None
+        from torch.utils.tensorboard import SummaryWriter
+
+        return SummaryWriter(str(self.directory / "tensorboard"), purge_step=self.step + 1)
+
+    # -- checkpoints --------------------------------------------------------------------------------------
+
+    def save_checkpoint(self) -> None:
+        """Write `checkpoints/STEP/`: the model, and all that a resumed run needs; whole or not at all."""
+        # Each process has its own random state.
+        state = torch.get_rng_state().to(self.accelerator.device)
+        states = self.accelerator.gather(state[None]).cpu()
+        if self.accelerator.is_main_process:
+            folder = self.directory / "checkpoints"
+            folder.mkdir(parents=True, exist_ok=True)
+            temporary = folder / f".{self.step:07d}"
+            shutil.rmtree(temporary, ignore_errors=True)
+            temporary.mkdir()
+            self.task.save(self.bare, temporary)
+            tensors = {f"random.{rank}": row.contiguous() for rank, row in enumerate(states)}
+            tensors |= {f"average.{name}": value.cpu() for name, value in self.average.items()}
+            tensors |= {f"model.{name}": value.cpu() for name, value in self.bare.state_dict().items()}
+            optimizer = self.optimizer.state_dict()
+            for index, entries in optimizer["state"].items():
+                tensors |= {f"optimizer.{index}.{name}": value.cpu() for name, value in entries.items()}
+            if torch.cuda.is_available():
+                tensors["random.cuda"] = torch.cuda.get_rng_state()
+            save_file(
+                {name: value.clone().contiguous() for name, value in tensors.items()},
+                temporary / "trainer.safetensors",
+            )
+            scaler = self.accelerator.scaler
+            described = {
+                "step": self.step,
+                "processes": self.accelerator.num_processes,
+                "config": asdict(self.config),
+                "scaler": scaler.state_dict() if scaler is not None else None,
+            }
+            with written_whole(temporary / "trainer.json") as file:
+                file.write_text(json.dumps(described, indent=1) + "\n")
+            final = folder / f"{self.step:07d}"
+            shutil.rmtree(final, ignore_errors=True)
+            temporary.rename(final)
+            for old in sorted(folder.glob("[0-9]*"))[: -self.config.keep]:
+                shutil.rmtree(old)
+        self.accelerator.wait_for_everyone()
+
+    def resume(self) -> bool:
+        """Go on from the newest checkpoint of the directory; False where there is none.
+
+        Raises
+        ------
+        OptionError
+            If it was made with another configuration or number of processes.
+        FileFormatError
+            If it is damaged.
+        """
+        found = sorted((self.directory / "checkpoints").glob("[0-9]*"))
+        if not found:
+            return False
+        try:
+            described = json.loads((found[-1] / "trainer.json").read_text())
+            tensors = load_file(found[-1] / "trainer.safetensors")
+        except (OSError, ValueError) as error:
+            raise FileFormatError(f"{found[-1]} is not a checkpoint of a training run: {error}") from error
+        fixed = asdict(self.config)
+        for name in ("log_every", "save_every", "keep"):
+            fixed.pop(name), described["config"].pop(name, None)
+        changed = [name for name in fixed if described["config"].get(name) != fixed[name]]
+        if changed or described["processes"] != self.accelerator.num_processes:
+            raise OptionError(
+                f"{found[-1]} was made with another {', '.join(changed) or 'number of processes'}: "
+                "use the same options, or another directory"
+            )
+
+        def part(prefix: str) -> dict[str, Tensor]:
+            return {n.removeprefix(prefix): t for n, t in tensors.items() if n.startswith(prefix)}
+
+        self.bare.load_state_dict(part("model."))
+        for name, value in part("average.").items():
+            self.average[name].copy_(value)
+        state: dict[int, dict[str, Tensor]] = {}
+        for name, value in part("optimizer.").items():
+            index, key = name.split(".", 1)
+            state.setdefault(int(index), {})[key] = value
+        groups = self.optimizer.state_dict()["param_groups"]
+        self.optimizer.load_state_dict({"state": state, "param_groups": groups})
+        if self.accelerator.scaler is not None:
+            self.accelerator.scaler.load_state_dict(described["scaler"])
+        torch.set_rng_state(tensors[f"random.{self.accelerator.process_index}"].cpu())
+        if "random.cuda" in tensors and torch.cuda.is_available():
+            torch.cuda.set_rng_state(tensors["random.cuda"])
+        self.step = described["step"]
+        return True
+
+    def _save_result(self) -> None:
+        model = self.bare
+        own = {name: parameter.detach().clone() for name, parameter in model.named_parameters()}
+        temporary = self.directory / ".model"
+        shutil.rmtree(temporary, ignore_errors=True)
+        temporary.mkdir(parents=True)
+        with torch.no_grad():
+            for name, parameter in model.named_parameters():
+                parameter.copy_(self.average.get(name, parameter))
+            self.task.save(model, temporary)
+            for name, parameter in model.named_parameters():
+                parameter.copy_(own[name])
+        final = self.directory / "model"
+        shutil.rmtree(final, ignore_errors=True)
+        temporary.rename(final)
