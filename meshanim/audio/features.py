@@ -204,7 +204,13 @@ def autocorrelation(
 
 
 def feature_windows(
-    features: Float[Tensor, "steps dim"], rate: float, fps: float, frames: int, width: int = 16
+    features: Float[Tensor, "steps dim"],
+    rate: float,
+    fps: float,
+    frames: int,
+    width: int = 16,
+    first: int = 0,
+    offset: int = 0,
 ) -> Float[Tensor, "frames width dim"]:
     """For each animation frame the `width` feature frames around it, by linear interpolation in time.
 
@@ -222,6 +228,10 @@ def feature_windows(
         Animation frames.
     width : int
         Feature frames a window; 16 in VOCA and GAVA.
+    first : int
+        The first animation frame, where only a part of the speech is asked for.
+    offset : int
+        Which feature frame of the speech `features[0]` is, where earlier ones are no longer at hand.
 
     Returns
     -------
@@ -240,7 +250,7 @@ def feature_windows(
         raise OptionError(
             f"rate {rate}, fps {fps}, width {width}, frames {frames}; expected positive numbers"
         )
-    centres = (torch.arange(frames, dtype=torch.float64) + 0.5) * (rate / fps) - 0.5
+    centres = (torch.arange(first, first + frames, dtype=torch.float64) + 0.5) * (rate / fps) - 0.5 - offset
     position = centres[:, None] + torch.arange(width, dtype=torch.float64) - (width - 1) / 2
     position = position.clamp(0, len(features) - 1).to(features.device)
     lower = position.floor().long()

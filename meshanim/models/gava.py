@@ -1,7 +1,8 @@
 """GAVA: speech to a talking, turning head by attention over the mesh (Li et al., TVCG 2025)."""
 
 import json
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -67,7 +68,7 @@ class GavaConfig:
         The attention pattern, as in `MeshGraph.from_faces`.
     style : int
         Width of the style vector.
-    subjects, emotions : tuple of str
+    subjects, emotions : sequence of str
         Names that styles were learned for. A subject that is not named gets the mean style.
     encoder : str
         The speech encoder whose features the network reads, as `load_encoder` takes it.
@@ -81,7 +82,7 @@ class GavaConfig:
     Raises
     ------
     OptionError
-        If a name is not one of those above or a number is out of range.
+        If a number is out of range.
     """
 
     feature_dim: int
@@ -103,8 +104,8 @@ class GavaConfig:
     rings: int = 1
     self_loops: bool = True
     style: int = 16
-    subjects: tuple[str, ...] = ()
-    emotions: tuple[str, ...] = ("neutral",)
+    subjects: Sequence[str] = ()
+    emotions: Sequence[str] = ("neutral",)
     encoder: str = "visemes"
     feature_rate: float = 50.0
     mel_rate: float = 100.0
@@ -112,14 +113,6 @@ class GavaConfig:
     head: str = ""
 
     def __post_init__(self):
-        choices = {
-            "features": ("LG", "L", "G"),
-            "fusion": ("sum", "concat"),
-            "decoder": ("gava", "sa", "mlp"),
-        }
-        for name, allowed in choices.items():
-            if getattr(self, name) not in allowed:
-                raise OptionError(f"{name} must be one of {', '.join(allowed)}, not {getattr(self, name)!r}")
         for name in ("feature_dim", "width", "layers", "heads", "window", "mel_bands", "mel_frames", "rank"):
             if getattr(self, name) < 1:
                 raise OptionError(f"{name} must be at least 1, not {getattr(self, name)}")
@@ -388,8 +381,7 @@ class Gava(nn.Module, PyTorchModelHubMixin):
         with written_whole(save_directory / WEIGHTS) as temporary:
             save_file(state, temporary)
         with written_whole(save_directory / CONFIG) as temporary:
-            fields = {name: getattr(self.config, name) for name in self.config.__dataclass_fields__}
-            temporary.write_text(json.dumps(fields, indent=2) + "\n")
+            temporary.write_text(json.dumps(asdict(self.config), indent=2) + "\n")
 
     @classmethod
     def _from_pretrained(
@@ -401,7 +393,7 @@ class Gava(nn.Module, PyTorchModelHubMixin):
         force_download: bool,
         local_files_only: bool,
         token: str | bool | None,
-        config: GavaConfig | dict | None = None,
+        config: GavaConfig | None = None,
         map_location: str = "cpu",
     ) -> "Gava":
         if config is None:
@@ -423,12 +415,11 @@ class Gava(nn.Module, PyTorchModelHubMixin):
             )
         try:
             state = load_file(weights, device=map_location)
-            config = config if isinstance(config, GavaConfig) else GavaConfig(**config)
             surface = VertexTokens.from_state(
                 {name.removeprefix("surface."): t for name, t in state.items() if name.startswith("surface.")}
             )
             model = cls(config, surface)
             model.load_state_dict(state)
-        except (OSError, SafetensorError, KeyError, TypeError, RuntimeError) as error:
+        except (OSError, SafetensorError, RuntimeError) as error:
             raise FileFormatError(f"{weights} is not a GAVA checkpoint: {error}") from error
         return model.to(map_location).eval()

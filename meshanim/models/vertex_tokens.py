@@ -1,6 +1,7 @@
 """`VertexTokens`: the vertices a network attends over, what it knows of them, and the way to the mesh."""
 
 import numpy as np
+import scipy.sparse as sp
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
@@ -101,18 +102,20 @@ class VertexTokens(nn.Module):
         eigenfunctions : int
             As in `vertex_descriptors`.
         """
-        descriptors, edges = vertex_descriptors(mesh, eigenfunctions), mesh.edges
-        prolongation = restriction = None
+        coarse, carriers = mesh, []
         if tokens != "vertices" and int(tokens) < mesh.n_vertices:
-            raise NotImplementedError
+            from meshanim.geometry import prolongation
+
+            spread = prolongation(mesh, int(tokens))
+            coarse, carriers = spread.mesh, [_rows(spread.operator), _rows(spread.restriction)]
+        descriptors = vertex_descriptors(coarse, eigenfunctions)
         return cls(
             torch.from_numpy(mesh.vertices.astype(np.float32)),
             torch.from_numpy(mesh.faces),
-            torch.from_numpy(edges),
+            torch.from_numpy(coarse.edges),
             torch.from_numpy(descriptors.astype(np.float32)),
             torch.full((len(descriptors),), 1e-3),
-            prolongation,
-            restriction,
+            *carriers,
         )
 
     @classmethod
@@ -167,3 +170,9 @@ class VertexTokens(nn.Module):
     def prolong(self, moved: Float[Tensor, "batch tokens 3"]) -> Float[Tensor, "batch vertices 3"]:
         """Displacements of the tokens to displacements of all vertices."""
         return moved.float() if self.prolongation is None else self.prolongation(moved)
+
+
+def _rows(matrix: sp.csr_array) -> SparseRows:
+    entries = matrix.tocoo()
+    rows, columns, values = (torch.from_numpy(a) for a in (entries.row, entries.col, entries.data))
+    return SparseRows(rows, columns, values, matrix.shape)

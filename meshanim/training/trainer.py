@@ -10,7 +10,7 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import torch
 from accelerate import Accelerator
@@ -86,6 +86,7 @@ class TrainConfig:
             raise OptionError(f"ema must be in [0, 1), not {self.ema}")
 
 
+@runtime_checkable
 class TrainingTask(Protocol):
     """What a trainer needs to know of a model's data and loss."""
 
