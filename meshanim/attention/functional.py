@@ -6,7 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from meshanim.attention import native
 from meshanim.attention.graph import MeshGraph
+from meshanim.attention.native import attention_native
 from meshanim.attention.reference import attention_reference, edge_probabilities
 from meshanim.errors import BackendError, OptionError, ShapeError
 
@@ -77,9 +79,9 @@ def mesh_attention(
     _check(query, key, value, graph)
     scale = query.shape[-1] ** -0.5 if scale is None else scale
     backend = _choose(backend, query)
-    if backend == "reference":
-        return attention_reference(query, key, value, graph, scale)
-    raise BackendError(f"backend {backend!r} is not built: use backend='reference'")
+    if backend == "native":
+        return attention_native(query.float(), key.float(), value.float(), graph, scale).to(query.dtype)
+    return attention_reference(query, key, value, graph, scale)
 
 
 def attention_maps(
@@ -102,7 +104,21 @@ def attention_maps(
 def _choose(backend: str, query: Tensor) -> str:
     if backend not in BACKENDS:
         raise OptionError(f"backend {backend!r} is not one of {', '.join(BACKENDS)}")
-    return "reference" if backend == "auto" else backend
+    if backend == "auto":
+        fast = query.device.type == "cpu" and query.dtype != torch.float64 and native.available()
+        return "native" if fast else "reference"
+    if backend == "native":
+        if not native.available():
+            raise BackendError(
+                "backend 'native' is not built: install meshanim with a C++17 compiler at hand, "
+                "or use backend='reference'"
+            )
+        if query.device.type != "cpu" or query.dtype == torch.float64:
+            raise BackendError(
+                f"backend 'native' computes float32 on the CPU, not {query.dtype} on {query.device}: "
+                "use backend='reference'"
+            )
+    return backend
 
 
 def _check(query: Tensor, key: Tensor, value: Tensor, graph: MeshGraph) -> None:

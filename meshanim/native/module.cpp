@@ -28,6 +28,8 @@ static Isa &selected() {
 
 Isa current_isa() { return selected(); }
 
+void bind_attention(nb::module_ &m);
+
 NB_MODULE(_native, m) {
     m.doc() = "Compiled kernels of meshanim.";
     m.def("instruction_set", [] { return std::string(NAMES[int(selected())]); },
@@ -40,4 +42,5 @@ NB_MODULE(_native, m) {
             }
         throw std::invalid_argument("instruction set '" + name + "' is not available on this processor");
     }, nb::arg("name"), "Run the kernels on another instruction set (for tests); ValueError if the processor lacks it.");
+    bind_attention(m);
 }

@@ -1,0 +1,194 @@
+// One vector of floats for every instruction set: 16 lanes on AVX-512, 8 on AVX2, 4 in portable C++.
+//
+// Include it in a *.kernel.cpp and use `simd::` inside namespace MESHANIM_NAMESPACE. Loads and stores need no
+// alignment. A comment "b on NaN" says which operand survives, so that a NaN is never dropped unnoticed.
+#pragma once
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <limits>
+
+#include "isa.h"
+
+#if defined(__AVX512F__) || defined(__AVX2__)
+#include <immintrin.h>
+#endif
+
+namespace MESHANIM_NAMESPACE {
+namespace simd {
+
+constexpr float INF = std::numeric_limits<float>::infinity();
+
+#if defined(__AVX512F__)
+
+constexpr int LANES = 16;
+using Floats = __m512;
+
+inline __mmask16 first_lanes(int n) { return __mmask16((1u << n) - 1u); }
+inline Floats broadcast(float x) { return _mm512_set1_ps(x); }
+inline Floats load(const float *p) { return _mm512_loadu_ps(p); }
+inline void store(float *p, Floats a) { _mm512_storeu_ps(p, a); }
+// The first n lanes, 0 <= n <= LANES; zeros beyond.
+inline Floats load_first(const float *p, int n) { return _mm512_maskz_loadu_ps(first_lanes(n), p); }
+inline void store_first(float *p, Floats a, int n) { _mm512_mask_storeu_ps(p, first_lanes(n), a); }
+inline Floats fma(Floats a, Floats b, Floats c) { return _mm512_fmadd_ps(a, b, c); }
+inline Floats maximum(Floats a, Floats b) { return _mm512_max_ps(a, b); }  // b on NaN
+inline Floats minimum(Floats a, Floats b) { return _mm512_min_ps(a, b); }  // b on NaN
+inline Floats round(Floats a) { return _mm512_roundscale_ps(a, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC); }
+// a times two to the power n, n whole and within +-300.
+inline Floats scale_by_power(Floats a, Floats n) { return _mm512_scalef_ps(a, n); }
+
+// The lanes moved down by `distance` (a power of two), those that fall out coming in at the top.
+inline Floats rotate(Floats a, int distance) {
+    switch (distance) {
+        case 8: return _mm512_shuffle_f32x4(a, a, 0x4e);
+        case 4: return _mm512_shuffle_f32x4(a, a, 0x39);
+        case 2: return _mm512_castsi512_ps(_mm512_alignr_epi32(_mm512_castps_si512(a), _mm512_castps_si512(a), 2));
+        default: return _mm512_castsi512_ps(_mm512_alignr_epi32(_mm512_castps_si512(a), _mm512_castps_si512(a), 1));
+    }
+}
+
+// Lane i is the sum of the lanes of rows[i].
+inline Floats sums(const Floats (&rows)[LANES]) {
+    Floats quads[4];
+    for (int i = 0; i < 4; ++i) {
+        const Floats *r = rows + 4 * i;
+        const Floats ab = _mm512_unpacklo_ps(r[0], r[1]) + _mm512_unpackhi_ps(r[0], r[1]);
+        const Floats cd = _mm512_unpacklo_ps(r[2], r[3]) + _mm512_unpackhi_ps(r[2], r[3]);
+        const __m512d x = _mm512_castps_pd(ab), y = _mm512_castps_pd(cd);
+        quads[i] = _mm512_castpd_ps(_mm512_unpacklo_pd(x, y)) + _mm512_castpd_ps(_mm512_unpackhi_pd(x, y));
+    }
+    const Floats low = _mm512_shuffle_f32x4(quads[0], quads[1], 0x88) + _mm512_shuffle_f32x4(quads[0], quads[1], 0xdd);
+    const Floats high = _mm512_shuffle_f32x4(quads[2], quads[3], 0x88) + _mm512_shuffle_f32x4(quads[2], quads[3], 0xdd);
+    return _mm512_shuffle_f32x4(low, high, 0x88) + _mm512_shuffle_f32x4(low, high, 0xdd);
+}
+
+#elif defined(__AVX2__)
+
+constexpr int LANES = 8;
+using Floats = __m256;
+
+inline __m256i first_lanes(int n) {
+    return _mm256_cmpgt_epi32(_mm256_set1_epi32(n), _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7));
+}
+inline Floats broadcast(float x) { return _mm256_set1_ps(x); }
+inline Floats load(const float *p) { return _mm256_loadu_ps(p); }
+inline void store(float *p, Floats a) { _mm256_storeu_ps(p, a); }
+inline Floats load_first(const float *p, int n) { return _mm256_maskload_ps(p, first_lanes(n)); }
+inline void store_first(float *p, Floats a, int n) { _mm256_maskstore_ps(p, first_lanes(n), a); }
+inline Floats fma(Floats a, Floats b, Floats c) { return _mm256_fmadd_ps(a, b, c); }
+inline Floats maximum(Floats a, Floats b) { return _mm256_max_ps(a, b); }
+inline Floats minimum(Floats a, Floats b) { return _mm256_min_ps(a, b); }
+inline Floats round(Floats a) { return _mm256_round_ps(a, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC); }
+// In two halves, so that denormal results come out right.
+inline Floats scale_by_power(Floats a, Floats n) {
+    const __m256i whole = _mm256_cvtps_epi32(n), half = _mm256_srai_epi32(whole, 1), bias = _mm256_set1_epi32(127);
+    const __m256i rest = _mm256_sub_epi32(whole, half);
+    a *= _mm256_castsi256_ps(_mm256_slli_epi32(_mm256_add_epi32(half, bias), 23));
+    return a * _mm256_castsi256_ps(_mm256_slli_epi32(_mm256_add_epi32(rest, bias), 23));
+}
+
+inline Floats rotate(Floats a, int distance) {
+    const __m256i lane = _mm256_add_epi32(_mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7), _mm256_set1_epi32(distance));
+    return _mm256_permutevar8x32_ps(a, lane);
+}
+
+inline Floats sums(const Floats (&rows)[LANES]) {
+    Floats quads[2];
+    for (int i = 0; i < 2; ++i) {
+        const Floats *r = rows + 4 * i;
+        const Floats ab = _mm256_unpacklo_ps(r[0], r[1]) + _mm256_unpackhi_ps(r[0], r[1]);
+        const Floats cd = _mm256_unpacklo_ps(r[2], r[3]) + _mm256_unpackhi_ps(r[2], r[3]);
+        const __m256d x = _mm256_castps_pd(ab), y = _mm256_castps_pd(cd);
+        quads[i] = _mm256_castpd_ps(_mm256_unpacklo_pd(x, y)) + _mm256_castpd_ps(_mm256_unpackhi_pd(x, y));
+    }
+    return _mm256_permute2f128_ps(quads[0], quads[1], 0x20) + _mm256_permute2f128_ps(quads[0], quads[1], 0x31);
+}
+
+#else
+
+constexpr int LANES = 4;
+struct Floats {
+    float lane[LANES];
+};
+
+template <class Function>
+inline Floats each(Function function) {
+    Floats result;
+    for (int i = 0; i < LANES; ++i) result.lane[i] = function(i);
+    return result;
+}
+inline Floats operator+(Floats a, Floats b) { return each([&](int i) { return a.lane[i] + b.lane[i]; }); }
+inline Floats operator-(Floats a, Floats b) { return each([&](int i) { return a.lane[i] - b.lane[i]; }); }
+inline Floats operator*(Floats a, Floats b) { return each([&](int i) { return a.lane[i] * b.lane[i]; }); }
+inline Floats operator/(Floats a, Floats b) { return each([&](int i) { return a.lane[i] / b.lane[i]; }); }
+inline Floats &operator+=(Floats &a, Floats b) { return a = a + b; }
+inline Floats &operator*=(Floats &a, Floats b) { return a = a * b; }
+inline Floats broadcast(float x) { return each([&](int) { return x; }); }
+inline Floats load(const float *p) { return each([&](int i) { return p[i]; }); }
+inline void store(float *p, Floats a) { std::memcpy(p, a.lane, sizeof a); }
+inline Floats load_first(const float *p, int n) { return each([&](int i) { return i < n ? p[i] : 0.0f; }); }
+inline void store_first(float *p, Floats a, int n) { std::memcpy(p, a.lane, n * sizeof(float)); }
+inline Floats fma(Floats a, Floats b, Floats c) { return a * b + c; }
+inline Floats maximum(Floats a, Floats b) { return each([&](int i) { return a.lane[i] > b.lane[i] ? a.lane[i] : b.lane[i]; }); }
+inline Floats minimum(Floats a, Floats b) { return each([&](int i) { return a.lane[i] < b.lane[i] ? a.lane[i] : b.lane[i]; }); }
+inline Floats round(Floats a) { return each([&](int i) { return std::nearbyint(a.lane[i]); }); }
+inline float power_of_two(int n) {
+    const uint32_t bits = uint32_t(n + 127) << 23;
+    float result;
+    std::memcpy(&result, &bits, sizeof result);
+    return result;
+}
+inline Floats scale_by_power(Floats a, Floats n) {
+    return each([&](int i) {
+        const int whole = n.lane[i] == n.lane[i] ? int(n.lane[i]) : 0, half = whole >> 1;
+        return a.lane[i] * power_of_two(half) * power_of_two(whole - half);
+    });
+}
+inline Floats rotate(Floats a, int distance) { return each([&](int i) { return a.lane[(i + distance) % LANES]; }); }
+inline Floats sums(const Floats (&rows)[LANES]) {
+    return each([&](int i) {
+        const float *r = rows[i].lane;
+        return (r[0] + r[2]) + (r[1] + r[3]);
+    });
+}
+
+#endif
+
+inline Floats zeros() { return broadcast(0.0f); }
+
+// Combine the lanes whose indices are equal modulo `period` (a power of two); every lane gets its result.
+inline Floats fold_sum(Floats a, int period) {
+    for (int distance = LANES / 2; distance >= period; distance /= 2) a += rotate(a, distance);
+    return a;
+}
+inline Floats fold_maximum(Floats a, int period) {
+    for (int distance = LANES / 2; distance >= period; distance /= 2) a = maximum(a, rotate(a, distance));
+    return a;
+}
+inline float sum(Floats a) {
+    float lanes[LANES];
+    store(lanes, fold_sum(a, 1));
+    return lanes[0];
+}
+
+// e^x within 2 ulp, denormal results included; exp(-inf) = 0, exp(inf) = inf, NaN stays NaN.
+// Cody-Waite reduction to |r| <= ln(2) / 2, then a minimax polynomial of degree 6 (error 3e-9).
+inline Floats exp(Floats x) {
+    x = maximum(broadcast(-106.0f), minimum(broadcast(90.0f), x));
+    const Floats n = round(x * broadcast(1.44269504f));
+    Floats r = fma(n, broadcast(-0.693359375f), x);
+    r = fma(n, broadcast(2.12194440e-4f), r);
+    Floats p = broadcast(1.394197810e-03f);
+    p = fma(p, r, broadcast(8.368760347e-03f));
+    p = fma(p, r, broadcast(4.166638851e-02f));
+    p = fma(p, r, broadcast(1.666651964e-01f));
+    p = fma(p, r, broadcast(0.5f));
+    p = fma(p, r, broadcast(1.0f));
+    p = fma(p, r, broadcast(1.0f));
+    return scale_by_power(p, n);
+}
+
+}  // namespace simd
+}  // namespace MESHANIM_NAMESPACE
