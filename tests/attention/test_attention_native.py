@@ -231,7 +231,7 @@ with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
 
 
 def test_compiles_without_a_graph_break():
-    # A process of its own: the shape checks of the tests cannot be traced. The backend that needs no C++ compiler
+    # A process of its own: the shape checks of the tests cannot be traced. The backend without a C++ compiler
     # asks the same of the operators as inductor does, in a tenth of the time.
     subprocess.run([sys.executable, "-c", COMPILED, "aot_eager"], check=True, cwd="/")
 
