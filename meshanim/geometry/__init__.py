@@ -7,7 +7,8 @@ from meshanim.geometry.geodesics import HeatGeodesics
 from meshanim.geometry.laplacian import cotangent_laplacian, vertex_masses
 from meshanim.geometry.mesh import TriangleMesh
 from meshanim.geometry.normals import face_normals, vertex_normals
-from meshanim.geometry.subdivision import bilinear_operator, catmull_clark_operator
+from meshanim.geometry.quad_subdivision import bilinear_operator, catmull_clark_operator
+from meshanim.geometry.subdivision import Subdivision, split_faces, subdivide
 from meshanim.geometry.transfer import SparseOperator, carry, transfer_operator
 from meshanim.geometry.uv import rasterize_uv
 
@@ -16,6 +17,7 @@ __all__ = [
     "HeatGeodesics",
     "Prolongation",
     "SparseOperator",
+    "Subdivision",
     "SurfacePoints",
     "TriangleFrames",
     "TriangleMesh",
@@ -28,6 +30,8 @@ __all__ = [
     "face_normals",
     "prolongation",
     "rasterize_uv",
+    "split_faces",
+    "subdivide",
     "transfer_operator",
     "triangle_frames",
     "vertex_masses",

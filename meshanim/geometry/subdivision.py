@@ -1,171 +1,200 @@
-"""Subdivision of quadrilateral meshes, one step at a time, as sparse matrices on per-vertex values.
+"""Subdivision of triangle meshes, as sparse matrices that carry positions and all other values along."""
 
-An operator S of shape (new vertices, old vertices) carries positions, blendshapes, normals' sources,
-weights or a whole animation: `S @ values`. Rows sum to one.
-"""
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
-from meshanim.errors import MeshError, ShapeError
+from meshanim.errors import OptionError, ShapeError
+from meshanim.geometry.mesh import TriangleMesh
+from meshanim.geometry.stencils import averages, incidence, rows_where, scaled, tidy
+from meshanim.geometry.topology import edge_uses
 
-__all__ = ["bilinear_operator", "catmull_clark_operator"]
+__all__ = ["Subdivision", "split_faces", "subdivide"]
 
-
-def catmull_clark_operator(
-    quads: Int[np.ndarray, "quads 4"],
-    n_vertices: int,
-    creases: Int[np.ndarray, "creases 2"] | None = None,
-) -> tuple[sp.csr_array, Int[np.ndarray, "new_quads 4"]]:
-    """One Catmull-Clark step (Catmull and Clark 1978) as a sparse matrix.
-
-    Boundary edges, edges of three or more quads and `creases` are subdivided as cubic B-spline curves; a
-    vertex where other than two of them meet stays where it is, as does a vertex that no quad uses.
-
-    Parameters
-    ----------
-    quads : (Q, 4) int
-        Vertex indices, in order around each quad.
-    n_vertices : int
-        Number of old vertices.
-    creases : (C, 2) int, optional
-        Interior edges to keep sharp, by their vertex indices.
-
-    Returns
-    -------
-    operator : (V + E + Q, V) sparse
-        Rows in this order: old vertices, edges (sorted by their vertex pair), quads.
-    quads : (4 Q, 4) int
-        Quads 4 i to 4 i + 3 lie in old quad i, at its corners in turn; each starts at the old corner and
-        keeps the old orientation.
-
-    Raises
-    ------
-    MeshError
-        If a quad repeats a vertex or names one that does not exist, or a crease is not an edge.
-    """
-    edges, edge_of_side, new_quads = _split_quads(quads, n_vertices)
-    n_edges = len(edges)
-    face_points, midpoints = _centroids(quads, n_vertices), _centroids(edges, n_vertices)
-    faces_of_edge = _incidence(edge_of_side, n_edges)
-    uses = np.bincount(edge_of_side.ravel(), minlength=n_edges)
-    sharp = uses != 2
-    if creases is not None:
-        sharp |= _marked_edges(edges, creases, n_vertices)
-
-    smooth_edge_points = 0.5 * midpoints + 0.25 * (faces_of_edge @ face_points)
-    edge_points = _rows_where(sharp, midpoints, smooth_edge_points)
-
-    faces_of_vertex, edges_of_vertex = _incidence(quads, n_vertices), _incidence(edges, n_vertices)
-    valence = np.maximum(edges_of_vertex.sum(1), 1)
-    face_valence = np.maximum(faces_of_vertex.sum(1), 1)
-    n_sharp = edges_of_vertex @ sharp.astype(float)
-    unused = edges_of_vertex.sum(1) == 0
-    smooth = (
-        _scaled(1 / (valence * face_valence), faces_of_vertex @ face_points)
-        + _scaled(2 / valence**2, edges_of_vertex @ midpoints)
-        + sp.diags_array((valence - 3) / valence)
-    )
-    curve = _scaled(
-        np.full(n_vertices, 0.25), edges_of_vertex @ _scaled(sharp.astype(float), midpoints)
-    ) + 0.5 * sp.diags_array(np.ones(n_vertices))
-    on_curve = n_sharp == 2
-    fixed = unused | ((n_sharp > 0) & ~on_curve)
-    vertex_points = _rows_where(
-        fixed, sp.diags_array(np.ones(n_vertices)), _rows_where(on_curve, curve, smooth)
-    )
-
-    return _tidy(sp.vstack([vertex_points, edge_points, face_points]).tocsr()), new_quads
+METHODS = ("midpoint", "loop", "centroid", "barycentric")
 
 
-def bilinear_operator(
-    quads: Int[np.ndarray, "quads 4"], n_vertices: int
-) -> tuple[sp.csr_array, Int[np.ndarray, "new_quads 4"]]:
-    """One bilinear step: old vertices stay, edges get their midpoint, quads their centroid.
+@dataclass(frozen=True)
+class Subdivision:
+    """A finer mesh; new positions, blendshapes or frames are `operator @ old`."""
 
-    The quads come out in the order of `catmull_clark_operator`, so a texture layout subdivided by this
-    fits the surface subdivided by that.
+    mesh: TriangleMesh
+    operator: sp.csr_array
+    """(new vertices, V), rows sum to one; the old vertices come first."""
+    parent: np.ndarray
+    """(new faces,) int: the old face in which each new one lies; ascending."""
+
+
+def subdivide(mesh: TriangleMesh, method: str = "midpoint", steps: int = 1) -> Subdivision:
+    """Subdivide every triangle of a mesh, texture coordinates included.
 
     Parameters
     ----------
-    quads : (Q, 4) int
-        Indices of texture coordinates (or of vertices), in order around each quad.
-    n_vertices : int
-        Number of old texture coordinates.
-
-    Returns
-    -------
-    operator : (V + E + Q, V) sparse
-        Rows: old vertices, edges (sorted by their vertex pair), quads.
-    quads : (4 Q, 4) int
-        Four quads for each old one, as in `catmull_clark_operator`.
+    mesh : TriangleMesh
+        Any; edges of one face, or of three and more, are kept as curves by "loop".
+    method : str
+        "midpoint": four triangles by the midpoints of the sides, the shape stays. "loop": the same
+        triangles on the smooth surface of Loop (1987), boundaries as cubic B-splines. "centroid": three
+        triangles around the centroid. "barycentric": six, by the medians.
+    steps : int
+        How often, 0 or more.
 
     Raises
     ------
-    MeshError
-        If a quad repeats a vertex or names one that does not exist.
+    OptionError
+        If the method does not exist or `steps` is negative.
     """
-    edges, _, new_quads = _split_quads(quads, n_vertices)
+    if method not in METHODS:
+        raise OptionError(f"method must be one of {', '.join(METHODS)}, not {method!r}")
+    if steps < 0:
+        raise OptionError(f"steps must be 0 or more, not {steps}")
+    operator = sp.diags_array(np.ones(mesh.n_vertices)).tocsr()
+    parent = np.arange(mesh.n_faces)
+    for _ in range(steps):
+        weights, faces, child_of = _step(mesh.faces, mesh.n_vertices, method)
+        operator, parent = (weights @ operator).tocsr(), parent[child_of]
+        uv, uv_faces = None, None
+        if mesh.uv is not None and mesh.uv_faces is not None:
+            linear = "midpoint" if method == "loop" else method
+            uv_weights, uv_faces, _ = _step(mesh.uv_faces, len(mesh.uv), linear)
+            uv = uv_weights @ mesh.uv
+        mesh = TriangleMesh(weights @ mesh.vertices, faces, uv, uv_faces)
+    return Subdivision(mesh, tidy(operator), parent)
+
+
+def split_faces(
+    mesh: TriangleMesh,
+    selected: Int[np.ndarray, " selected"] | Bool[np.ndarray, " faces"],
+    conforming: bool = True,
+) -> Subdivision:
+    """Split selected triangles in four by the midpoints of their sides; the shape stays.
+
+    Parameters
+    ----------
+    mesh : TriangleMesh
+        Texture coordinates follow.
+    selected : (n,) int or (F,) bool
+        Faces to split.
+    conforming : bool
+        If true, no vertex is left in the middle of an unsplit side: a neighbour with one split side is cut
+        in two, one with more is split in four as well, and so on (red-green refinement, Bank, Sherman and
+        Weiser 1983). If false, the other triangles stay as they are.
+
+    Raises
+    ------
+    OptionError
+        If a face does not exist.
+    ShapeError
+        If a mask has not one entry a face.
+    """
+    red = _mask(selected, mesh.n_faces)
+    edges, edge_of_side = edge_uses(mesh.faces)
+    split = np.zeros(len(edges), bool)
+    split[edge_of_side[red]] = True
+    while conforming and (more := (split[edge_of_side].sum(1) > 1) & ~red).any():
+        red = red | more
+        split[edge_of_side[more]] = True
+    cut = split[edge_of_side] if conforming else np.repeat(red[:, None], 3, axis=1)
+
+    operator, faces, parent = _split_sides(mesh.faces, mesh.n_vertices, cut)
+    uv, uv_faces = None, None
+    if mesh.uv is not None and mesh.uv_faces is not None:
+        uv_operator, uv_faces, _ = _split_sides(mesh.uv_faces, len(mesh.uv), cut)
+        uv = uv_operator @ mesh.uv
+    return Subdivision(TriangleMesh(operator @ mesh.vertices, faces, uv, uv_faces), operator, parent)
+
+
+def _mask(selected: np.ndarray, n_faces: int) -> np.ndarray:
+    if selected.dtype == bool:
+        if len(selected) != n_faces:
+            raise ShapeError(f"selected has {len(selected)} entries, the mesh {n_faces} faces")
+        return selected
+    if selected.size and (selected.min() < 0 or selected.max() >= n_faces):
+        raise OptionError(f"selected names faces {selected.min()}..{selected.max()}, but there are {n_faces}")
+    mask = np.zeros(n_faces, bool)
+    mask[selected] = True
+    return mask
+
+
+def _step(faces: np.ndarray, n_vertices: int, method: str) -> tuple[sp.csr_array, np.ndarray, np.ndarray]:
+    """Weights of the new vertices, new faces, and the old face of each."""
+    if method in ("midpoint", "loop"):
+        operator, new_faces, parent = _split_sides(faces, n_vertices, np.ones((len(faces), 3), bool))
+        if method == "loop":
+            operator = _loop_weights(faces, n_vertices)
+        return operator, new_faces, parent
     identity = sp.diags_array(np.ones(n_vertices))
-    blocks = [identity, _centroids(edges, n_vertices), _centroids(quads, n_vertices)]
-    return _tidy(sp.vstack(blocks).tocsr()), new_quads
+    after = np.roll(faces, -1, axis=1)
+    if method == "centroid":
+        centre = np.repeat(n_vertices + np.arange(len(faces))[:, None], 3, axis=1)
+        operator = sp.vstack([identity, averages(faces, n_vertices)])
+        children = np.stack([faces, after, centre], axis=2)
+    else:
+        edges, edge_of_side = edge_uses(faces)
+        middle = n_vertices + edge_of_side
+        centre = np.repeat(n_vertices + len(edges) + np.arange(len(faces))[:, None], 3, axis=1)
+        operator = sp.vstack([identity, averages(edges, n_vertices), averages(faces, n_vertices)])
+        children = np.concatenate(
+            [np.stack([faces, middle, centre], axis=2), np.stack([middle, after, centre], axis=2)], axis=1
+        )
+    return (
+        tidy(operator.tocsr()),
+        children.reshape(-1, 3),
+        np.repeat(np.arange(len(faces)), children.shape[1]),
+    )
 
 
-def _split_quads(quads: np.ndarray, n_vertices: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Edges (E, 2), the edge of each side (Q, 4; side k runs from corner k to k + 1), the new quads."""
-    if quads.ndim != 2 or quads.shape[1] != 4:
-        raise ShapeError(f"quads must have shape (n, 4), not {quads.shape}")
-    if quads.size and (quads.min() < 0 or quads.max() >= n_vertices):
-        raise MeshError(f"quads name vertices {quads.min()}..{quads.max()}, but there are {n_vertices}")
-    ordered = np.sort(quads, axis=1)
-    repeated = np.flatnonzero((ordered[:, 1:] == ordered[:, :-1]).any(1))
-    if len(repeated):
-        raise MeshError(f"{len(repeated)} quads name a vertex twice, the first is quad {repeated[0]}")
-    sides = np.stack([quads, np.roll(quads, -1, axis=1)], axis=2)
-    edges, edge_of_side = np.unique(np.sort(sides.reshape(-1, 2), axis=1), axis=0, return_inverse=True)
-    edge_of_side = edge_of_side.reshape(-1, 4)
-    centre = n_vertices + len(edges) + np.arange(len(quads))
-    after = n_vertices + edge_of_side
-    corners = [quads, after, np.repeat(centre[:, None], 4, axis=1), np.roll(after, 1, axis=1)]
-    return edges, edge_of_side, np.stack(corners, axis=2).reshape(-1, 4)
+def _split_sides(
+    faces: np.ndarray, n_vertices: int, cut: np.ndarray
+) -> tuple[sp.csr_array, np.ndarray, np.ndarray]:
+    """Split faces at the midpoints of the sides marked in `cut` (F, 3): none, one or all three of each."""
+    edges, edge_of_side = edge_uses(faces)
+    is_cut = np.zeros(len(edges), bool)
+    is_cut[edge_of_side[cut]] = True
+    operator = sp.vstack([sp.diags_array(np.ones(n_vertices)), averages(edges[is_cut], n_vertices)])
+    middle = n_vertices + (np.cumsum(is_cut) - 1)[edge_of_side]
+
+    number = cut.sum(1)
+    whole, halved, quartered = (np.flatnonzero(number == n) for n in (0, 1, 3))
+    # Halved faces, turned so that their first side is the cut one.
+    turn = (cut[halved].argmax(1)[:, None] + np.arange(3)) % 3
+    a, b, c = np.take_along_axis(faces[halved], turn, axis=1).T
+    ab = middle[halved, turn[:, 0]]
+    halves = np.stack([np.stack([a, ab, c], 1), np.stack([ab, b, c], 1)], axis=1)
+    p, q, r = faces[quartered].T
+    pq, qr, rp = middle[quartered].T
+    corners = [[p, pq, rp], [q, qr, pq], [r, rp, qr], [pq, qr, rp]]
+    quarters = np.stack([np.stack(child, axis=1) for child in corners], axis=1)
+
+    parent = np.concatenate([whole, np.repeat(halved, 2), np.repeat(quartered, 4)])
+    children = np.concatenate([faces[whole], halves.reshape(-1, 3), quarters.reshape(-1, 3)])
+    order = np.argsort(parent, kind="stable")
+    return tidy(operator.tocsr()), children[order], parent[order]
 
 
-def _centroids(polygons: np.ndarray, n_vertices: int) -> sp.csr_array:
-    """(P, V) matrix that averages the corners of each polygon."""
-    count, corners = polygons.shape
-    rows = np.repeat(np.arange(count), corners)
-    data = np.full(polygons.size, 1.0 / corners)
-    return sp.csr_array((data, (rows, polygons.ravel())), shape=(count, n_vertices))
+def _loop_weights(faces: np.ndarray, n_vertices: int) -> sp.csr_array:
+    """Loop's rules, rows as in `_split_sides`: old vertices, then edges."""
+    edges, edge_of_side = edge_uses(faces)
+    uses = np.bincount(edge_of_side.ravel(), minlength=len(edges))
+    curve = uses != 2
+    midpoints = averages(edges, n_vertices)
+    # 3/8 of the ends and 1/8 of the opposite corners = 1/4 of the ends and 3/8 of each face's centroid.
+    beside = incidence(edge_of_side, len(edges)) @ averages(faces, n_vertices)
+    edge_points = rows_where(curve, midpoints, 0.25 * midpoints + 0.375 * beside)
 
-
-def _incidence(polygons: np.ndarray, size: int) -> sp.csr_array:
-    """(size, P) matrix of ones where polygon p uses element i."""
-    count, corners = polygons.shape
-    columns = np.repeat(np.arange(count), corners)
-    return sp.csr_array((np.ones(polygons.size), (polygons.ravel(), columns)), shape=(size, count))
-
-
-def _marked_edges(edges: np.ndarray, marked: np.ndarray, n_vertices: int) -> np.ndarray:
-    keys = edges[:, 0] * n_vertices + edges[:, 1]
-    ordered = np.sort(marked, axis=1)
-    wanted = ordered[:, 0] * n_vertices + ordered[:, 1]
-    unknown = np.flatnonzero(~np.isin(wanted, keys))
-    if len(unknown):
-        raise MeshError(f"crease {tuple(marked[unknown[0]].tolist())} is not an edge of the mesh")
-    return np.isin(keys, wanted)
-
-
-def _scaled(weights: np.ndarray, matrix: sp.sparray) -> sp.csr_array:
-    return (sp.diags_array(weights) @ matrix).tocsr()
-
-
-def _rows_where(choice: np.ndarray, first: sp.sparray, second: sp.sparray) -> sp.csr_array:
-    return _scaled(choice.astype(float), first) + _scaled((~choice).astype(float), second)
-
-
-def _tidy(operator: sp.csr_array) -> sp.csr_array:
-    operator.sum_duplicates()
-    operator.eliminate_zeros()
-    operator.sort_indices()
-    return operator
+    edges_of_vertex = incidence(edges, n_vertices)
+    valence = edges_of_vertex.sum(1)
+    n = np.maximum(valence, 1)
+    beta = (0.625 - (0.375 + 0.25 * np.cos(2 * np.pi / n)) ** 2) / n
+    # The sum over neighbours is twice the sum of edge midpoints less the vertex itself, once an edge.
+    smooth = scaled(2 * beta, edges_of_vertex @ midpoints) + sp.diags_array(1 - 2 * n * beta)
+    n_curves = edges_of_vertex @ curve.astype(float)
+    on_curve = n_curves == 2
+    along = 0.25 * edges_of_vertex @ scaled(curve.astype(float), midpoints)
+    spline = along + 0.5 * sp.diags_array(np.ones(n_vertices))
+    fixed = (valence == 0) | ((n_curves > 0) & ~on_curve)
+    identity = sp.diags_array(np.ones(n_vertices))
+    vertex_points = rows_where(fixed, identity, rows_where(on_curve, spline, smooth))
+    return tidy(sp.vstack([vertex_points, edge_points]).tocsr())
