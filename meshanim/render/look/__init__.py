@@ -1,6 +1,7 @@
 """The procedural look of the default head: skin, eyes, teeth, hair, wrinkles, and a dozen people."""
 
-from meshanim.render.look.appearance import SKIN_CHANNELS, Appearance
+from meshanim.render.look.appearance import SKIN_CHANNELS, Appearance, make_appearance
+from meshanim.render.look.assets import LookAssets, look_assets
 from meshanim.render.look.eyes import Eye, EyeMaterial, eye_mesh, pose_eye
 from meshanim.render.look.person import PersonParameters
 from meshanim.render.look.strands import Strands, strand_points
@@ -13,12 +14,15 @@ __all__ = [
     "Appearance",
     "Eye",
     "EyeMaterial",
+    "LookAssets",
     "PersonParameters",
     "Strands",
     "Surface",
     "Teeth",
     "Wrinkles",
     "eye_mesh",
+    "look_assets",
+    "make_appearance",
     "pose_eye",
     "pose_teeth",
     "strand_points",

@@ -3,16 +3,23 @@
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from jaxtyping import Float
 
-from meshanim.render.look.eyes import Eye
+from meshanim.errors import OptionError
+from meshanim.heads import DefaultHead, HeadParameters
+from meshanim.render.look.assets import LookAssets, look_assets
+from meshanim.render.look.eyes import Eye, make_eye, make_eye_material
+from meshanim.render.look.groom import skin_shade
+from meshanim.render.look.hair import grow_hair
 from meshanim.render.look.person import PersonParameters
+from meshanim.render.look.skin import micro_detail, paint_skin, paint_tongue
 from meshanim.render.look.strands import Strands
-from meshanim.render.look.surface import Surface
-from meshanim.render.look.teeth import Teeth
-from meshanim.render.look.wrinkles import Wrinkles
+from meshanim.render.look.surface import Surface, vertex_normals
+from meshanim.render.look.teeth import Teeth, make_teeth
+from meshanim.render.look.wrinkles import Wrinkles, make_wrinkles
 
-__all__ = ["SKIN_CHANNELS", "Appearance"]
+__all__ = ["SKIN_CHANNELS", "Appearance", "make_appearance"]
 
 SKIN_CHANNELS = ("red", "green", "blue", "roughness", "specular", "mouth", "detail", "scatter")
 """Channels of the skin texture: linear albedo; GGX roughness; specular scale (1 is F0 = 0.028); share of
@@ -33,7 +40,7 @@ class Appearance:
     template : (V, 3) float32
         The person's resting head, rest expression included: the template to animate.
     surface, tongue : Surface
-        Skin and tongue, subdivided; linear in the head's vertices.
+        Skin and tongue, subdivided; linear in the head's vertices. Both use `skin` and `height`.
     skin : (S, S, 8) float32
         `SKIN_CHANNELS`.
     height : (S, S) float32
@@ -43,8 +50,6 @@ class Appearance:
         pictures that resolve 1.2 pixels a millimetre or more.
     wrinkles : Wrinkles
         Expression wrinkles, added to `height`.
-    tongue_texture : (T, T, 4) float32
-        Linear albedo and roughness of the tongue.
     strands : tuple of Strands
         Hair, brows, beard and lashes.
     eyes : (Eye, Eye)
@@ -69,10 +74,99 @@ class Appearance:
     height: Float[np.ndarray, "size size"]
     detail: Float[np.ndarray, "tile tile 2"]
     wrinkles: Wrinkles
-    tongue_texture: Float[np.ndarray, "tongue_size tongue_size 4"]
     strands: tuple[Strands, ...]
     eyes: tuple[Eye, Eye]
     teeth: tuple[Teeth, Teeth]
     sky: Float[np.ndarray, " surface_vertices"]
     mouth_front: float
     neck_fade: Float[np.ndarray, "loop 2"]
+
+
+def make_appearance(
+    head: DefaultHead,
+    person: PersonParameters,
+    size: int = 1024,
+    assets: LookAssets | None = None,
+) -> Appearance:
+    """Paint, groom and equip one person; the same arguments give the same arrays bit by bit.
+
+    Parameters
+    ----------
+    head : DefaultHead
+    person : PersonParameters
+    size : int
+        Texels along one side of the skin texture.
+    assets : LookAssets, optional
+        From `look_assets(head, size)`, to make several people without preparing the head again.
+
+    Raises
+    ------
+    OptionError
+        If the head knows no such identity, or the person has more shape coefficients than the head.
+    """
+    assets = look_assets(head, size) if assets is None else assets
+    shape = _shape(head, person)
+    template = _template(head, person, shape)
+    on_skin = assets.skin.vertices(template)
+    paint = paint_skin(assets.atlas, person)
+    paint_tongue(assets.tongue_atlas, person, paint)
+    strands, shade = grow_hair(assets.ground, paint, assets.lashes, person)
+    sky = assets.sky
+    if shade is not None:
+        rest = assets.ground.vertices
+        under = skin_shade(shade, rest * 1000.0, vertex_normals(rest, assets.skin.faces))
+        sky = (sky * (0.25 + 0.75 * under)).astype(np.float32)
+    eyes = tuple(
+        make_eye(head.parts[name].vertices, template, make_eye_material(person, side))
+        for side, name in enumerate(("left_eye", "right_eye"))
+    )
+    teeth = tuple(
+        make_teeth(jaw, head.parts[f"{jaw}_teeth"].vertices, assets.vertices, template, person)
+        for jaw in ("upper", "lower")
+    )
+    loop = template[head.neck_loop][:, [2, 1]]
+    loop = loop[np.argsort(loop[:, 0], kind="stable")]
+    return Appearance(
+        person,
+        shape,
+        template,
+        assets.skin,
+        assets.tongue,
+        paint.skin,
+        paint.height,
+        micro_detail(),
+        make_wrinkles(assets.atlas, person, head.expression_names),
+        strands,
+        (eyes[0], eyes[1]),
+        (teeth[0], teeth[1]),
+        sky,
+        _mouth_front(on_skin),
+        np.ascontiguousarray(loop, np.float32),
+    )
+
+
+def _shape(head: DefaultHead, person: PersonParameters) -> Float[np.ndarray, " shape"]:
+    """Shape coefficients, padded with zeros to the head's number."""
+    if person.identity:
+        return head.person(person.identity)[0].numpy().astype(np.float32)
+    shape = np.zeros(len(head.shape_names), np.float32)
+    if len(person.shape) > len(shape):
+        raise OptionError(f"person has {len(person.shape)} shape coefficients, the head {len(shape)}")
+    shape[: len(person.shape)] = person.shape
+    return shape
+
+
+def _template(
+    head: DefaultHead, person: PersonParameters, shape: np.ndarray
+) -> Float[np.ndarray, "head_vertices 3"]:
+    parameters = HeadParameters(
+        shape=torch.from_numpy(shape)[None], expression=head.expression(person.rest_expression)
+    )
+    with torch.no_grad():
+        return head(parameters)[0].numpy()
+
+
+def _mouth_front(on_skin: np.ndarray) -> float:
+    """z of the lips' inner front at the middle of the face, metres."""
+    near = (np.abs(on_skin[:, 0]) < 0.002) & (on_skin[:, 2] > 0.01) & (np.abs(on_skin[:, 1] + 0.04) < 0.006)
+    return float(np.quantile(on_skin[near, 2], 0.7))

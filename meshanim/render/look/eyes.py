@@ -176,15 +176,15 @@ def make_eye_material(
     return EyeMaterial(np.ascontiguousarray(iris, np.float32), np.ascontiguousarray(sclera, np.float32))
 
 
-def _periodic(draws: np.random.Generator, harmonics: int):
-    """A smooth random function of an angle."""
+def _periodic(draws: np.random.Generator, harmonics: int, samples: int = 4096):
+    """A smooth random function of an angle, tabled."""
     order = np.arange(1, harmonics + 1)
     sine, cosine = draws.normal(size=(2, harmonics)) / order**0.3
+    angle = np.arange(samples + 1) / samples * 2 * np.pi
+    phase = angle[:, None] * order
+    table = (np.sin(phase) @ sine + np.cos(phase) @ cosine) / np.sqrt(harmonics)
 
-    def evaluate(angle: np.ndarray) -> np.ndarray:
-        result = np.zeros(np.shape(angle))
-        for k, a, b in zip(order, sine, cosine):
-            result += a * np.cos(k * angle) + b * np.sin(k * angle)
-        return result / np.sqrt(harmonics)
+    def evaluate(at: np.ndarray) -> np.ndarray:
+        return np.interp(np.mod(at, 2 * np.pi), angle, table)
 
     return evaluate

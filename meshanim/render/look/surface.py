@@ -118,7 +118,7 @@ def sky_visibility(
         Size of a depth cell, metres.
     """
     normals = vertex_normals(vertices, faces)
-    samples = _surface_samples(vertices, faces, 0.75 * cell)
+    samples = np.ascontiguousarray(_surface_samples(vertices, faces, 0.9 * cell).T, np.float32)
     index = np.arange(directions) + 0.5
     height, angle = 1 - 2 * index / directions, index * np.pi * (3 - np.sqrt(5))
     ring = np.sqrt(1 - height**2)
@@ -128,14 +128,15 @@ def sky_visibility(
         across = np.cross(direction, [0.0, 0.0, 1.0] if abs(direction[2]) < 0.9 else [1.0, 0.0, 0.0])
         across /= np.linalg.norm(across)
         basis = np.stack([across, np.cross(direction, across), -direction], axis=1)
-        points = samples @ basis
-        low = points.min(0) - 0.004
-        column = ((points[:, :2] - low[:2]) / cell).astype(np.int64)
-        width, rows = column.max(0) + 6
-        depth = np.full(width * rows, np.inf)
-        np.minimum.at(depth, column[:, 1] * width + column[:, 0], points[:, 2])
         seen = lifted @ basis
-        at = ((seen[:, :2] - low[:2]) / cell).astype(np.int64)
+        low = seen.min(0)[:2] - 0.004
+        width, rows = ((seen.max(0)[:2] + 0.004 - low) / cell).astype(int) + 1
+        points = basis.T.astype(np.float32) @ samples
+        column = ((points[0] - np.float32(low[0])) * np.float32(1 / cell)).astype(np.int32)
+        row = ((points[1] - np.float32(low[1])) * np.float32(1 / cell)).astype(np.int32)
+        depth = np.full(width * rows, np.inf, np.float32)
+        np.minimum.at(depth, row * width + column, points[2])
+        at = ((seen[:, :2] - low) / cell).astype(np.int64)
         facing = np.clip(normals @ direction, 0, None)
         visible += facing * (depth[at[:, 1] * width + at[:, 0]] > seen[:, 2] - 0.0012)
         weight += facing

@@ -1,0 +1,310 @@
+"""Scalp hair: strands traced from the roots along a style's flow, clear of the head, gathered into locks."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+
+from meshanim.render.look.groom import Ground, HairShade, hair_colors, make_strands, strand_occlusion, unit
+from meshanim.render.look.paint import blob, smoothstep
+from meshanim.render.look.person import PersonParameters
+from meshanim.render.look.regions import hairline
+from meshanim.render.look.strands import Strands
+
+__all__ = ["scalp_hair"]
+
+WHORL = np.array([4.0, 145.0, -80.0])
+BUN = np.array([0.0, 112.0, -152.0])
+EAR = ((78, 14, -22), (16, 26, 20))
+
+Points = Float[np.ndarray, "strands 3"]
+
+
+@dataclass(frozen=True)
+class _Style:
+    """How one style is traced. Lengths in millimetres.
+
+    `flow(points, roots, person)` is the direction hair wants to take; `length(roots, person)` how long it is.
+    """
+
+    flow: Callable[[np.ndarray, np.ndarray, PersonParameters], np.ndarray]
+    length: Callable[[np.ndarray, PersonParameters], np.ndarray]
+    count: int
+    steps: int
+    lift: float
+    volume: float
+    gravity: float
+    locks: int
+    gather: float
+    frizz: float
+    width: float
+    curl: float = 0.0
+    over_ears: float = 0.0
+
+
+def _blend(first: np.ndarray, second: np.ndarray, share: np.ndarray) -> np.ndarray:
+    return first * (1 - share[:, None]) + second * share[:, None]
+
+
+def _down(points: Points, back: float = -0.15) -> Points:
+    out = np.zeros_like(points)
+    out[:, 1] = -1
+    out[:, 2] = back
+    return out
+
+
+def _cropped(points: Points, roots: Points, person: PersonParameters) -> Points:
+    """From the whorl forwards, down at the sides and the back."""
+    away = unit((points - WHORL) * [1.0, 0.3, 1.0])
+    away = unit(away * [0.5, 1, 1] + [0, 0, 0.25])
+    side = smoothstep(48, 74, np.abs(points[:, 0])) * smoothstep(105, 70, points[:, 1])
+    back = smoothstep(-90, -115, points[:, 2]) * smoothstep(135, 110, points[:, 1])
+    return unit(_blend(away, unit(_down(points)), np.maximum(0.85 * side, back)))
+
+
+def _parted(points: Points, roots: Points, person: PersonParameters) -> Points:
+    """Combed sideways and back from a parting; down at the sides and the back."""
+    part = person.part_side * 1000
+    sign = np.sign(roots[:, 0] - part + 1e-6)
+    across = np.stack([sign, np.full(len(points), -0.15), np.full(len(points), -0.35)], axis=1)
+    front = smoothstep(0, 40, points[:, 2])[:, None]
+    across = across + front * np.array([0, 0.25, 0.15])
+    side = smoothstep(45, 72, np.abs(points[:, 0]))
+    back = smoothstep(-80, -110, points[:, 2])
+    return unit(_blend(unit(across), unit(_down(points, -0.35)), np.maximum(side, back)))
+
+
+def _hanging(points: Points, roots: Points, person: PersonParameters) -> Points:
+    """From a parting over the sides, then straight down; swept off the face."""
+    part = person.part_side * 1000
+    fade = smoothstep(-60, -100, roots[:, 2])[:, None]
+    sign = np.sign(roots[:, 0] - part + 1e-6)
+    across = np.stack([sign, np.full(len(points), -0.1), np.full(len(points), -0.30)], axis=1)
+    radial = unit((points - WHORL) * [1.0, 0.0, 1.0]) * [1.0, 1.0, 1.0]
+    across = unit(across * (1 - fade) + radial * fade)
+    face = smoothstep(10, 45, points[:, 2]) * smoothstep(100, 60, points[:, 1])
+    fall = _down(points, -0.05) - face[:, None] * np.array([0, 0, 0.6])
+    low = np.maximum(smoothstep(52, 74, np.abs(points[:, 0])), smoothstep(-95, -120, points[:, 2]))
+    low = np.maximum(low, smoothstep(95, 70, points[:, 1]))
+    inward = smoothstep(-30, -70, points[:, 1])[:, None] * np.stack(
+        [-np.sign(points[:, 0]) * 0.35, 0 * sign, 0.1 + 0 * sign], axis=1
+    )
+    return unit(_blend(across, unit(fall), low) + inward)
+
+
+def _tied(points: Points, roots: Points, person: PersonParameters) -> Points:
+    """Combed tightly to the knot."""
+    return unit(BUN - points)
+
+
+def _outwards(points: Points, roots: Points, person: PersonParameters) -> Points:
+    """Away from the skull, sagging a little."""
+    return unit(unit(points - np.array([0, 60, -35])) + np.array([0, -0.25, 0.1]))
+
+
+def _short_sides(roots: Points, person: PersonParameters) -> np.ndarray:
+    top = person.hair_length * 1000
+    sides = min(top, 9.0)
+    high = np.maximum(smoothstep(70, 105, roots[:, 1]), smoothstep(10, 30, roots[:, 2]))
+    high = high * smoothstep(76, 60, np.abs(roots[:, 0]))
+    return sides + (top - sides) * high
+
+
+def _to_one_level(roots: Points, person: PersonParameters) -> np.ndarray:
+    """Long enough for every tip to reach one height: over the skull to its side, then down."""
+    reach = np.sqrt(np.clip(1 - ((roots[:, 1] - 60) / 95) ** 2, 0, 1))
+    over = np.where(roots[:, 1] > 60, 95 * (np.pi / 2 - np.arcsin(np.clip(reach, 0, 1))), 0)
+    level = 60 - person.hair_length * 1000
+    return np.clip(over + np.minimum(roots[:, 1], 60) - level, 30, 400)
+
+
+def _to_knot(roots: Points, person: PersonParameters) -> np.ndarray:
+    return np.linalg.norm(roots - BUN, axis=1) * 1.12
+
+
+def _even(roots: Points, person: PersonParameters) -> np.ndarray:
+    return np.full(len(roots), person.hair_length * 1000)
+
+
+_STYLES = {
+    "buzz": _Style(_cropped, _even, 30000, 2, 0.55, 0.0, 0.1, 0, 0.0, 0.0, 0.16),
+    "crop": _Style(_cropped, _short_sides, 20000, 5, 0.55, 5.0, 0.25, 700, 0.45, 0.9, 0.16),
+    "parted": _Style(_parted, _short_sides, 16000, 8, 0.7, 9.0, 0.15, 420, 0.6, 1.0, 0.17),
+    "curls": _Style(_outwards, _even, 13000, 9, 0.8, 2.0, 0.05, 900, 0.7, 1.5, 0.20, 2.2),
+    "bob": _Style(_hanging, _to_one_level, 12000, 12, 0.55, 11.0, 0.2, 330, 0.6, 2.2, 0.20, 0.0, 15.0),
+    "long": _Style(_hanging, _to_one_level, 12000, 14, 0.55, 11.0, 0.25, 260, 0.65, 3.0, 0.20, 0.0, 15.0),
+    "bun": _Style(_tied, _to_knot, 13000, 9, 0.25, 3.0, 0.0, 500, 0.3, 0.6, 0.19, 0.0, 5.0),
+}
+
+
+def scalp_hair(
+    ground: Ground,
+    scalp: Float[np.ndarray, " texels"],
+    person: PersonParameters,
+    draws: np.random.Generator,
+) -> tuple[list[Strands], HairShade | None]:
+    """Grow a person's scalp hair on the mean head.
+
+    Parameters
+    ----------
+    ground : Ground
+    scalp : (n,) float
+        Density of roots a texel, in [0, 1].
+    person : PersonParameters
+    draws : numpy Generator
+    """
+    if person.hair == "none" or scalp.max() <= 0:
+        return [], None
+    style = _STYLES[person.hair]
+    texels = ground.sample(np.where(scalp > 0.15, scalp, 0), style.count, draws)
+    roots = ground.points[texels].astype(float)
+    length = style.length(roots, person) * draws.uniform(0.72, 1.06, len(roots))
+    edge = hairline(roots, person.baldness)
+    length = length * (0.45 + 0.55 * smoothstep(-3, 9, edge)) if person.hair != "bun" else length
+    points, normals = _trace(ground, style, roots, ground.atlas.normal[texels], length, person, draws)
+    if style.locks:
+        points = _gather(points, style, draws)
+    if style.frizz:
+        points = _frizz(points, style, draws)
+    if style.curl:
+        points = _curl(points, style, draws)
+    points = _clear(ground, points, style)
+    groups = [(texels, points, normals)]
+    if person.hair == "bun":
+        groups.append(_knot(ground, texels, draws))
+    occlusion, shade = _shade(groups, style.width)
+    strands = []
+    for (texel, path, normal), light in zip(groups, occlusion):
+        colors = hair_colors(person, len(texel), draws)
+        strands.append(
+            make_strands(
+                "hair", ground, texel, path[:, 1:] - path[:, :1], normal, light, style.width * 1e-3, colors
+            )
+        )
+    return strands, shade
+
+
+def _trace(
+    ground: Ground,
+    style: _Style,
+    roots: Points,
+    root_normals: np.ndarray,
+    length: np.ndarray,
+    person: PersonParameters,
+    draws: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Walk from the roots: points and outward normals (n, steps + 1, 3)."""
+    layer = draws.uniform(0.05, 1, len(roots))
+    step = (length / style.steps)[:, None]
+    flow = style.flow(roots, roots, person)
+    tangent = unit(flow - root_normals * (flow * root_normals).sum(1, keepdims=True))
+    tangent = unit(tangent + draws.normal(0, 0.16, roots.shape))
+    direction = unit(style.lift * root_normals + (1 - style.lift) * tangent)
+    points, normals = [roots], [root_normals.astype(float)]
+    here = roots
+    for index in range(style.steps):
+        moved = here + direction * step
+        normal, height = ground.nearest(moved)
+        along = (index + 1) / style.steps
+        hover = 0.4 + style.volume * layer * min(1.0, 2.5 * along)
+        hover = hover + style.over_ears * blob(moved, *EAR) * layer**0.5
+        moved = moved + normal * np.clip(hover - height, 0, None)[:, None]
+        excess = np.clip(height - hover - 0.5, 0, None)
+        if style.curl == 0:
+            moved = moved - normal * (0.35 * np.minimum(excess, 6))[:, None]
+        direction = unit(moved - here)
+        wanted = style.flow(moved, roots, person)
+        close = smoothstep(25, 5, height)[:, None]
+        wanted = unit(wanted - close * normal * np.minimum((wanted * normal).sum(1, keepdims=True), 0))
+        direction = unit(0.45 * direction + 0.55 * wanted + np.array([0, -style.gravity, 0]))
+        points.append(moved)
+        normals.append(normal)
+        here = moved
+    return np.stack(points, axis=1), np.stack(normals, axis=1)
+
+
+def _gather(points: np.ndarray, style: _Style, draws: np.random.Generator) -> np.ndarray:
+    """Pull every strand towards the leader of its lock, more so towards the tip."""
+    leaders = draws.choice(len(points), min(style.locks, len(points)), replace=False)
+    lock = leaders[cKDTree(points[leaders, 0]).query(points[:, 0])[1]]
+    along = np.linspace(0, 1, points.shape[1])[None, :, None]
+    own = points - points[:, :1]
+    led = points[lock] - points[lock, :1]
+    start = points[:, :1] - points[lock, :1]
+    share = style.gather * along * draws.uniform(0.6, 1.2, (len(points), 1, 1)).clip(max=1)
+    target = (
+        points[lock, :1]
+        + start * (1 - 0.75 * along)
+        + led
+        * np.linalg.norm(own, axis=2, keepdims=True)
+        / (np.linalg.norm(led, axis=2, keepdims=True) + 1e-6)
+    )
+    return points * (1 - share) + target * share
+
+
+def _frizz(points: np.ndarray, style: _Style, draws: np.random.Generator) -> np.ndarray:
+    """A slow random bend of each strand."""
+    along = np.linspace(0, 1, points.shape[1])[None, :, None]
+    phase = draws.uniform(0, 2 * np.pi, (len(points), 1, 3))
+    waves = draws.uniform(0.5, 1.4, (len(points), 1, 3))
+    amount = style.frizz * draws.gamma(2.0, 0.5, (len(points), 1, 1)) * along
+    return points + amount * (np.sin(2 * np.pi * waves * along + phase) - np.sin(phase))
+
+
+def _curl(points: np.ndarray, style: _Style, draws: np.random.Generator) -> np.ndarray:
+    """Wind each strand around its own path."""
+    forward = unit(np.gradient(points, axis=1))
+    across = unit(np.cross(forward, [0.3, 0.9, 0.2]))
+    other = np.cross(forward, across)
+    along = np.linspace(0, 1, points.shape[1])[None, :, None]
+    turns = draws.uniform(1.3, 2.2, (len(points), 1, 1)) * draws.choice([-1, 1], (len(points), 1, 1))
+    angle = 2 * np.pi * turns * along + draws.uniform(0, 2 * np.pi, (len(points), 1, 1))
+    radius = style.curl * draws.uniform(0.5, 1.3, (len(points), 1, 1)) * np.minimum(1, 3 * along)
+    return points + radius * (np.cos(angle) * across + np.sin(angle) * other)
+
+
+def _clear(ground: Ground, points: np.ndarray, style: _Style) -> np.ndarray:
+    """Push points that locks or frizz brought into the head back out."""
+    flat = points[:, 1:].reshape(-1, 3)
+    normal, height = ground.nearest(flat)
+    flat = flat + normal * np.clip(0.5 - height, 0, None)[:, None]
+    return np.concatenate([points[:, :1], flat.reshape(len(points), -1, 3)], axis=1)
+
+
+def _knot(ground: Ground, texels: np.ndarray, draws: np.random.Generator):
+    """A bun: strands wound around the knot in flat spirals, carried by the scalp nearest to it."""
+    count, steps, radius = 2600, 12, 27.0
+    carrier = texels[np.argsort(np.linalg.norm(ground.points[texels] - BUN, axis=1), kind="stable")[:50]]
+    carrier = draws.choice(carrier, count)
+    axis = unit(BUN - np.array([0.0, 70.0, -40.0]))
+    across = unit(np.cross(axis, [1.0, 0, 0]))
+    other = np.cross(axis, across)
+    latitude = draws.uniform(-0.5, 1.5, (count, 1))
+    angle = draws.uniform(0, 2 * np.pi, (count, 1)) + np.linspace(0, 1, steps + 1) * draws.uniform(
+        1.2, 3.0, (count, 1)
+    )
+    latitude = latitude + 0.35 * np.sin(angle * 1.5 + draws.uniform(0, 6.28, (count, 1)))
+    shell = radius * draws.uniform(0.72, 1.0, (count, 1))
+    ring, height = shell * np.cos(latitude), 0.72 * shell * np.sin(latitude)
+    around = np.cos(angle)[..., None] * across + np.sin(angle)[..., None] * other
+    offset = ring[..., None] * around + height[..., None] * axis
+    points = BUN + offset
+    points[:, 0] = ground.points[carrier]
+    points[:, 1] = points[:, 2] - 0.2 * (points[:, 3] - points[:, 2])
+    return carrier, points, unit(offset)
+
+
+def _shade(groups, width: float):
+    """Occlusion of each group in the density of all of them."""
+    steps = max(path.shape[1] for _, path, _ in groups)
+    padded = [
+        np.concatenate([p, np.repeat(p[:, -1:], steps - p.shape[1], axis=1)], axis=1) for _, p, _ in groups
+    ]
+    outward = [
+        np.concatenate([n, np.repeat(n[:, -1:], steps - n.shape[1], axis=1)], axis=1) for _, _, n in groups
+    ]
+    light, shade = strand_occlusion(np.concatenate(padded), np.concatenate(outward), width)
+    split = np.split(light, np.cumsum([len(p) for p in padded])[:-1])
+    return [part[:, : path.shape[1]] for part, (_, path, _) in zip(split, groups)], shade
