@@ -1,0 +1,426 @@
+// Deferred shading. A row's visibility samples are grouped into fragments (one a pixel inside a surface, more on
+// edges); materials are fetched a fragment at a time, lights run over the row's fragments as one vector loop.
+#include <algorithm>
+#include <cmath>
+#include <vector>
+
+#include "fragments.h"
+#include "raster.h"
+#include "vector.h"
+
+namespace MESHANIM_NAMESPACE {
+namespace {
+
+using namespace raster;
+
+constexpr float PI = 3.14159265f;
+constexpr float SPECULAR_NORMAL = 0.028f;    // Fresnel reflectance of skin at normal incidence
+constexpr float INSIDE = 0.15f;              // light that reaches the inner side of an open surface
+constexpr float SAME_SURFACE = 0.0025f;      // metres between samples of one fragment
+constexpr float IRIS_ANGLE = 0.345f, IRIS_PLANE = 0.925f, SCLERA_ANGLE = 1.95f, REFRACTIVE_INDEX = 1.34f;
+
+template <int CHANNELS> inline void sample(const Texture &t, float u, float v, float *out) {
+    const float x = clamp(u * t.width - 0.5f, 0.0f, t.width - 1.001f);
+    const float y = clamp((1 - v) * t.height - 0.5f, 0.0f, t.height - 1.001f);
+    const int i = int(x), j = int(y);
+    const float a = x - i, b = y - j;
+    const float *p = t.data + (int64_t(j) * t.width + i) * CHANNELS, *q = p + int64_t(t.width) * CHANNELS;
+    for (int k = 0; k < CHANNELS; ++k)
+        out[k] = (p[k] * (1 - a) + p[k + CHANNELS] * a) * (1 - b) + (q[k] * (1 - a) + q[k + CHANNELS] * a) * b;
+}
+
+inline void sample_tiled(const Texture &t, float u, float v, float *out) {
+    const float x = (u - std::floor(u)) * t.width, y = (1 - (v - std::floor(v))) * t.height;
+    const int i = std::min(int(x), t.width - 1), j = std::min(int(y), t.height - 1);
+    const int i1 = i + 1 == t.width ? 0 : i + 1, j1 = j + 1 == t.height ? 0 : j + 1;
+    const float a = x - i, b = y - j;
+    for (int k = 0; k < 2; ++k) {
+        const float top = t.data[(j * t.width + i) * 2 + k] * (1 - a) + t.data[(j * t.width + i1) * 2 + k] * a;
+        const float low = t.data[(j1 * t.width + i) * 2 + k] * (1 - a) + t.data[(j1 * t.width + i1) * 2 + k] * a;
+        out[k] = top * (1 - b) + low * b;
+    }
+}
+
+// Rows are the radius, columns the angle from -pi to pi, periodic.
+inline Vec sample_polar(const Texture &t, float radius, float angle) {
+    const float y = clamp(radius * t.height - 0.5f, 0.0f, t.height - 1.001f);
+    float x = (angle / (2 * PI) + 0.5f) * t.width - 0.5f;
+    if (x < 0) x += t.width;
+    const int i = std::min(int(x), t.width - 1), j = int(y), i1 = i + 1 == t.width ? 0 : i + 1;
+    const float a = x - i, b = y - j;
+    const float *p = t.data + int64_t(j) * t.width * 3, *q = p + int64_t(t.width) * 3;
+    return (load(p + 3 * i) * (1 - a) + load(p + 3 * i1) * a) * (1 - b) + (load(q + 3 * i) * (1 - a) + load(q + 3 * i1) * a) * b;
+}
+
+// Distance in millimetres to a polyline.
+inline float distance_to(const float *line, int n, Vec p) {
+    float best = 1e9f;
+    for (int k = 0; k + 1 < n; ++k) {
+        const Vec a = load(line + 3 * k), d = load(line + 3 * k + 3) - a, e = p - a;
+        const float t = clamp(dot(e, d) / (dot(d, d) + 1e-12f), 0.0f, 1.0f);
+        const Vec r = e - d * t;
+        best = std::min(best, dot(r, r));
+    }
+    return 1000 * std::sqrt(best);
+}
+
+inline float noise(int x, int y) {           // interleaved gradient noise (Jimenez 2014)
+    const float a = 0.06711056f * x + 0.00583715f * y, b = 52.9829189f * (a - std::floor(a));
+    return b - std::floor(b);
+}
+
+struct Eye {
+    Vec world_to_row[3];                     // rows of the camera's rotation
+    Vec position;
+    float fx, skew, cx, fy, cy;
+
+    explicit Eye(const View &v) {
+        const double *m = v.world_to_camera;
+        for (int k = 0; k < 3; ++k) world_to_row[k] = {float(m[4 * k]), float(m[4 * k + 1]), float(m[4 * k + 2])};
+        position = (world_to_row[0] * float(m[3]) + world_to_row[1] * float(m[7]) + world_to_row[2] * float(m[11])) * -1.0f;
+        fx = float(v.fx), skew = float(v.skew), cx = float(v.cx), fy = float(v.fy), cy = float(v.cy);
+    }
+    // Direction through a pixel with depth 1 along the viewing axis.
+    Vec ray(float x, float y) const {
+        const float b = (y - cy) / fy, a = (x - cx - skew * b) / fx;
+        return world_to_row[0] * a + world_to_row[1] * b + world_to_row[2];
+    }
+};
+
+struct Surface {                             // where a ray meets a face
+    Vec position, normal;
+    float weight[3];
+    bool back;                               // seen from inside
+};
+
+inline Surface meet(const Mesh &mesh, const Eye &eye, int32_t face, Vec ray) {
+    const int32_t *f = mesh.faces + 3 * face;
+    const Vec a = load(mesh.vertices + 3 * f[0]) - eye.position, b = load(mesh.vertices + 3 * f[1]) - eye.position,
+              c = load(mesh.vertices + 3 * f[2]) - eye.position;
+    float w[3] = {dot(ray, cross(b, c)), dot(ray, cross(c, a)), dot(ray, cross(a, b))};
+    Surface s;
+    s.back = w[0] + w[1] + w[2] > 0;
+    if (!s.back) w[0] = -w[0], w[1] = -w[1], w[2] = -w[2];
+    float sum = 0;
+    for (float &x : w) x = std::max(x, 0.0f), sum += x;
+    for (int k = 0; k < 3; ++k) s.weight[k] = sum > 0 ? w[k] / sum : 1.0f / 3;
+    s.position = eye.position + a * s.weight[0] + b * s.weight[1] + c * s.weight[2];
+    s.normal = load(mesh.normals + 3 * f[0]) * s.weight[0] + load(mesh.normals + 3 * f[1]) * s.weight[1] +
+               load(mesh.normals + 3 * f[2]) * s.weight[2];
+    if (s.back) s.normal = s.normal * -1.0f;
+    return s;
+}
+
+inline float vertex_value(const float *values, const int32_t *f, const float *w) {
+    return values[f[0]] * w[0] + values[f[1]] * w[1] + values[f[2]] * w[2];
+}
+
+// Collect the fragments of one row of pixels.
+int gather(const Mesh &mesh, const Part *parts, const Eye &eye, int samples, int width, int y, const int32_t *face,
+           const float *depth, Fragments &r) {
+    int n = 0;
+    const int total = samples * samples, stride = samples * width;
+    const float step = 1.0f / samples;
+    for (int x = 0; x < width; ++x) {
+        int32_t f[4];
+        float z[4];
+        bool any = false;
+        for (int s = 0; s < total; ++s) {
+            const int64_t at = int64_t(y * samples + s / samples) * stride + x * samples + s % samples;
+            f[s] = face[at], z[s] = depth[at];
+            any |= f[s] >= 0;
+        }
+        if (!any) continue;
+        for (int s = 0; s < total; ++s) {
+            if (f[s] < 0) continue;
+            const int32_t first = f[s];
+            const float near = z[s];
+            const int part = mesh.part[first];
+            int member[4], count = 0;
+            bool one_face = true;
+            float mx = 0, my = 0;
+            for (int t = s; t < total; ++t) {
+                if (f[t] < 0 || mesh.part[f[t]] != part || std::abs(z[t] - near) > SAME_SURFACE) continue;
+                mx += (t % samples + 0.5f) * step, my += (t / samples + 0.5f) * step;
+                one_face &= f[t] == first;
+                member[count++] = t;
+            }
+            mx /= count, my /= count;
+            Vec position{0, 0, 0}, normal{0, 0, 0}, color{0, 0, 0};
+            float u = 0, v = 0, sky = 0, fade = 0, u0 = 0, v0 = 0;
+            const int rays = one_face ? 1 : count;
+            for (int k = 0; k < rays; ++k) {
+                const int t = member[k];
+                const int32_t *corner = mesh.faces + 3 * f[t];
+                const Surface hit = one_face ? meet(mesh, eye, first, eye.ray(x + mx, y + my))
+                                             : meet(mesh, eye, f[t], eye.ray(x + (t % samples + 0.5f) * step, y + (t / samples + 0.5f) * step));
+                position = position + hit.position, normal = normal + hit.normal;
+                const float *uv = mesh.corner_uv + 6 * int64_t(f[t]), *w = hit.weight;
+                float a = uv[0] * w[0] + uv[2] * w[1] + uv[4] * w[2], b = uv[1] * w[0] + uv[3] * w[1] + uv[5] * w[2];
+                if (k == 0) u0 = a, v0 = b;
+                if (std::abs(a - u0) + std::abs(b - v0) > 0.03f) a = u0, b = v0;      // another island
+                u += a, v += b;
+                sky += vertex_value(mesh.sky, corner, w) * (hit.back ? INSIDE : 1.0f), fade += vertex_value(mesh.fade, corner, w);
+                if (mesh.colors)
+                    color = color + load(mesh.colors + 3 * corner[0]) * w[0] + load(mesh.colors + 3 * corner[1]) * w[1] +
+                            load(mesh.colors + 3 * corner[2]) * w[2];
+            }
+            const float share = 1.0f / rays;
+            position = position * share;
+            normal = unit(normal);
+            const Vec view = unit(eye.position - position);
+            r.pixel[n] = x, r.face[n] = first, r.part[n] = part;
+            r.coverage[n] = float(count) / total * clamp(fade * share, 0.0f, 1.0f);
+            r.depth[n] = near;
+            r.set(r.position, n, position), r.set(r.normal, n, normal), r.set(r.view, n, view);
+            r.set(r.bumped, n, normal), r.set(r.diffuse, n, normal), r.set(r.albedo, n, color * share);
+            r.u[n] = u * share, r.v[n] = v * share, r.occlusion[n] = clamp(sky * share, 0.0f, 1.0f);
+            r.roughness[n] = parts[part].roughness, r.specular[n] = parts[part].specular;
+            r.cornea[n] = -1, r.lit[n] = 1;
+            ++n;
+            for (int k = 0; k < count; ++k) f[member[k]] = -1;
+        }
+    }
+    return n;
+}
+
+void skin_material(const Mesh &mesh, const Part &part, Fragments &r, int i) {
+    float texel[8], slope[4];
+    const float u = r.u[i], v = r.v[i];
+    sample<8>(part.texture, u, v, texel);
+    sample<4>(part.slopes, u, v, slope);
+    const float cavity = clamp(slope[2] / 3.0e-4f, 0.0f, 1.0f);
+    r.albedo[0][i] = texel[0] * (1 - 0.22f * cavity);
+    r.albedo[1][i] = texel[1] * (1 - 0.36f * cavity);
+    r.albedo[2][i] = texel[2] * (1 - 0.38f * cavity);
+    r.roughness[i] = texel[3], r.specular[i] = texel[4] * part.specular;
+    r.lining[i] = texel[5];
+    // Surface gradient of the height by u and v (Mikkelsen 2010, eq. 4, with dP/du and dP/dv of the face).
+    const int64_t f = r.face[i];
+    const int32_t *corner = mesh.faces + 3 * f;
+    const float *uv = mesh.corner_uv + 6 * f;
+    const Vec p = load(mesh.vertices + 3 * corner[0]);
+    const Vec e1 = load(mesh.vertices + 3 * corner[1]) - p, e2 = load(mesh.vertices + 3 * corner[2]) - p;
+    const float a1 = uv[2] - uv[0], b1 = uv[3] - uv[1], a2 = uv[4] - uv[0], b2 = uv[5] - uv[1];
+    const float det = a1 * b2 - b1 * a2;
+    if (std::abs(det) < 1e-12f) return;
+    const Vec pu = (e1 * b2 - e2 * b1) * (1 / det), pv = (e2 * a1 - e1 * a2) * (1 / det), n = r.get(r.normal, i);
+    const Vec across = cross(pv, n), along = cross(n, pu);
+    const float volume = dot(pu, across);
+    if (std::abs(volume) < 1e-9f) return;
+    Vec gradient = (across * slope[0] + along * slope[1]) * (1 / volume);
+    gradient = gradient * std::min(1.0f, 1.2f / std::max(length(gradient), 1e-9f));
+    Vec bumped = unit(n - gradient), diffuse = unit(n - gradient * 0.75f);
+    if (part.detail_gain > 0) {
+        float micro[2];
+        sample_tiled(part.detail, u * 22, v * 22, micro);
+        const float gain = part.detail_gain * (0.35f + 0.65f * clamp(texel[6], 0.0f, 1.0f));
+        const Vec d = unit(pu) * (micro[0] * gain) + unit(pv) * (micro[1] * gain);
+        bumped = unit(bumped - d), diffuse = unit(diffuse - d * 0.6f);
+    }
+    r.set(r.bumped, i, bumped), r.set(r.diffuse, i, diffuse);
+}
+
+// Corneal refraction onto a flat iris; see look.eyes.EyeMaterial for the recipe.
+void eye_material(const Part &part, Fragments &r, int i) {
+    const float *m = part.rotation;
+    const Vec axis[3] = {{m[0], m[3], m[6]}, {m[1], m[4], m[7]}, {m[2], m[5], m[8]}};
+    const Vec e = (r.get(r.position, i) - load(part.center)) * (1 / part.radius), view = r.get(r.view, i);
+    const Vec q{dot(e, axis[0]), dot(e, axis[1]), dot(e, axis[2])};
+    const Vec v{dot(view, axis[0]), dot(view, axis[1]), dot(view, axis[2])};
+    const Vec n = unit(q);
+    const float theta = std::acos(clamp(n.z, -1.0f, 1.0f));
+    const float cornea = 1 - smoothstep(0.92f, 1.12f, theta / IRIS_ANGLE);
+    const Vec nc = unit(Vec{n.x * (1 + 0.75f * cornea), n.y * (1 + 0.75f * cornea), n.z});
+    const float eta = 1 / REFRACTIVE_INDEX, c = dot(nc, v);
+    const float k = std::sqrt(std::max(1 - eta * eta * (1 - c * c), 0.0f));
+    const Vec d = v * -eta + nc * (eta * c - k);
+    const float along = (IRIS_PLANE - q.z) / (std::abs(d.z) < 0.15f ? -0.15f : d.z);
+    const Vec u = q + d * clamp(along, 0.0f, 0.3f);
+    const float inverse = 1 / std::sin(IRIS_ANGLE);
+    const Vec iris = sample_polar(part.iris, std::sqrt(u.x * u.x + u.y * u.y) * inverse, std::atan2(u.y, u.x));
+    const Vec sclera = sample_polar(part.sclera, theta / SCLERA_ANGLE, std::atan2(n.y, n.x));
+    const float white = smoothstep(0.90f, 1.10f, theta / IRIS_ANGLE);
+    const Vec concave = unit(Vec{-0.75f * u.x * inverse, -0.75f * u.y * inverse, 1});
+    const Vec soft = concave * (1 - white) + n * white;
+    auto to_world = [&](Vec a) { return axis[0] * a.x + axis[1] * a.y + axis[2] * a.z; };
+    r.set(r.albedo, i, iris * (1 - white) + sclera * white);
+    r.set(r.bumped, i, to_world(nc)), r.set(r.diffuse, i, to_world(soft));
+    r.cornea[i] = 1 - white;
+    const Vec p = r.get(r.position, i);
+    if (part.n_upper > 1) r.occlusion[i] *= 0.24f + 0.76f * smoothstep(-0.5f, 3.4f, distance_to(part.upper_lid, part.n_upper, p));
+    if (part.n_lower > 1) r.occlusion[i] *= 0.65f + 0.35f * smoothstep(-0.2f, 1.6f, distance_to(part.lower_lid, part.n_lower, p));
+}
+
+void material(const Mesh &mesh, const Part &part, const Quality &quality, Fragments &r, int i) {
+    r.lining[i] = 0;
+    if (part.kind == SKIN) skin_material(mesh, part, r, i);
+    if (part.kind == EYE) eye_material(part, r, i);
+    if (part.kind == TEXTURED) {
+        float texel[4];
+        sample<4>(part.texture, r.u[i], r.v[i], texel);
+        for (int k = 0; k < 3; ++k) r.albedo[k][i] = texel[k];
+        r.roughness[i] = texel[3];
+    }
+    if (part.mouth_length > 0) {
+        const float *p = quality.mouth_plane;
+        const float behind = r.position[0][i] * p[0] + r.position[1][i] * p[1] + r.position[2][i] * p[2] + p[3];
+        float light = clamp(part.mouth_start - behind / part.mouth_length, part.mouth_floor, 1.0f);
+        if (part.mouth_power != 1) light = std::pow(light, part.mouth_power);
+        r.occlusion[i] *= part.kind == SKIN ? 1 - r.lining[i] * (1 - light) : light;
+    }
+}
+
+// Screen-space occlusion within 6 mm, for contact that the resting sky visibility does not know.
+float screen_occlusion(const Eye &eye, const Quality &q, int width, int height, const float *depth, const Fragments &r,
+                       int i, int y) {
+    const int s = q.samples;
+    const float reach = std::max(0.004f * q.pixels_per_metre, 1.0f), turn = noise(r.pixel[i], y) * 2 * PI;
+    const Vec p = r.get(r.position, i), n = r.get(r.normal, i);
+    float occlusion = 0, weight = 0;
+    for (int k = 0; k < q.occlusion_taps; ++k) {
+        const float radius = reach * (k + 0.5f) / q.occlusion_taps + 0.75f, angle = k * 2.399963f + turn;
+        const int x = int(std::floor((r.pixel[i] + 0.5f + radius * std::cos(angle)) * s));
+        const int v = int(std::floor((y + 0.5f + radius * std::sin(angle)) * s));
+        if (x < 0 || v < 0 || x >= width * s || v >= height * s) continue;
+        ++weight;
+        const float z = depth[int64_t(v) * width * s + x];
+        if (!(z < 1e30f)) continue;
+        const Vec d = eye.position + eye.ray((x + 0.5f) / s, (v + 0.5f) / s) * z - p;
+        const float l = length(d) + 1e-9f, c = dot(d, n) / l;
+        if (c > 0.12f) occlusion += (c - 0.12f) * std::max(0.0f, 1 - (l / 0.006f) * (l / 0.006f));
+    }
+    return std::max(0.0f, 1 - 2.1f * occlusion / std::max(weight, 1.0f));
+}
+
+// Share of a disc in the shadow map that is not nearer to the light.
+float shadow(const View &light, const float *map, const Quality &q, Vec p, Vec n, float turn) {
+    constexpr float BIAS = 0.0012f;
+    const Vec a = p + n * BIAS;
+    const double *m = light.world_to_camera;
+    const float x = float((m[0] * a.x + m[1] * a.y + m[2] * a.z + m[3]) * light.fx + light.cx);
+    const float y = float((m[4] * a.x + m[5] * a.y + m[6] * a.z + m[7]) * light.fy + light.cy);
+    const float z = float(m[8] * a.x + m[9] * a.y + m[10] * a.z + m[11]) - BIAS;
+    const float reach = q.shadow_radius * float(light.fx);
+    float sum = 0;
+    for (int k = 0; k < q.shadow_taps; ++k) {
+        const float radius = reach * std::sqrt((k + 0.5f) / q.shadow_taps), angle = k * 2.399963f + turn;
+        const int i = int(std::floor(x + radius * std::cos(angle))), j = int(std::floor(y + radius * std::sin(angle)));
+        if (i < 0 || j < 0 || i >= light.width || j >= light.height || map[int64_t(j) * light.width + i] > z) ++sum;
+    }
+    return sum / q.shadow_taps;
+}
+
+// Wrapped diffuse and two GGX lobes of every light, over all fragments of the row.
+void lights(const Lighting &lighting, const Part *parts, const Quality &q, Fragments &r, int n) {
+#pragma omp simd
+    for (int i = 0; i < n; ++i) {
+        const float up = r.diffuse[1][i] * 0.5f + 0.5f, ao = r.occlusion[i], root = std::sqrt(ao);
+        const float red = root * (0.45f + 0.55f * root);
+        r.irradiance[0][i] = (lighting.ground[0] + (lighting.sky[0] - lighting.ground[0]) * up) * red;
+        r.irradiance[1][i] = (lighting.ground[1] + (lighting.sky[1] - lighting.ground[1]) * up) * ao;
+        r.irradiance[2][i] = (lighting.ground[2] + (lighting.sky[2] - lighting.ground[2]) * up) * ao;
+        r.reflection[0][i] = r.reflection[1][i] = r.reflection[2][i] = 0;
+    }
+    for (int j = 0; j < lighting.n; ++j) {
+        const float *l = lighting.direction[j], *c = lighting.color[j];
+        const bool shadowed = j == lighting.shadowed;
+        const bool two = q.lobes > 1;
+#pragma omp simd
+        for (int i = 0; i < n; ++i) {
+            const float ao = r.occlusion[i], lit = shadowed ? r.lit[i] : 1.0f;
+            const float nd = r.diffuse[0][i] * l[0] + r.diffuse[1][i] * l[1] + r.diffuse[2][i] * l[2];
+            const float amount = lit * std::min(1.0f, 0.4f + 0.6f * ao) * (1.35f / PI);
+            for (int k = 0; k < 3; ++k) {
+                const float w = r.wrap[k][i], d = (nd + w) / (1 + w);
+                r.irradiance[k][i] += c[k] * amount * std::max(d, 0.0f);
+            }
+            const float nx = r.bumped[0][i], ny = r.bumped[1][i], nz = r.bumped[2][i];
+            const float vx = r.view[0][i], vy = r.view[1][i], vz = r.view[2][i];
+            const float nl = nx * l[0] + ny * l[1] + nz * l[2];
+            const float nv = std::max(0.05f, nx * vx + ny * vy + nz * vz);
+            const float hx = l[0] + vx, hy = l[1] + vy, hz = l[2] + vz;
+            const float inverse = 1 / std::sqrt(hx * hx + hy * hy + hz * hz + 1e-12f);
+            const float nh = std::min(1.0f, std::max(0.0f, (nx * hx + ny * hy + nz * hz) * inverse));
+            const float vh = std::max(0.0f, (vx * hx + vy * hy + vz * hz) * inverse);
+            const float g = 1 - vh, fresnel = SPECULAR_NORMAL + (1 - SPECULAR_NORMAL) * g * g * g * g * g;
+            float sum = 0;
+            for (int lobe = 0; lobe < 2; ++lobe) {
+                const float rough = lobe == 0 ? r.roughness[i] : std::max(0.08f, r.roughness[i] * 0.62f);
+                const float a2 = rough * rough * rough * rough, t = nh * nh * (a2 - 1) + 1;
+                const float k = (rough + 1) * (rough + 1) * 0.125f;
+                const float d = a2 / (PI * t * t * (nl * (1 - k) + k) * (nv * (1 - k) + k));
+                sum += (two ? (lobe == 0 ? 0.7f : 0.3f) : (lobe == 0 ? 1.0f : 0.0f)) * d;
+            }
+            const float shine = nl > 0 ? r.specular[i] * lit * ao * sum * 0.25f * fresnel * nl : 0.0f;
+            for (int k = 0; k < 3; ++k) r.reflection[k][i] += shine * c[k];
+        }
+    }
+    // Reflection of the sky: a horizon gradient; eyes see one soft box instead.
+    for (int i = 0; i < n; ++i) {
+        const Vec b = r.get(r.bumped, i), v = r.get(r.view, i);
+        const float nv = dot(b, v), edge = 1 - clamp(nv, 0.0f, 1.0f), ao = r.occlusion[i];
+        const Vec mirror = b * (2 * nv) - v;
+        const float rough = 1 - r.roughness[i], s = clamp(mirror.y * 0.5f + 0.5f, 0.0f, 1.0f);
+        const float fresnel = SPECULAR_NORMAL + 0.5f * rough * rough * edge * edge * edge * edge * edge;
+        const float amount = (0.10f + 0.55f * s * s) * fresnel * r.specular[i] * ao * (0.35f + 0.3f * rough);
+        r.reflection[0][i] += 0.9f * amount, r.reflection[1][i] += amount, r.reflection[2][i] += 1.1f * amount;
+        if (parts[r.part[i]].kind != EYE) continue;
+        const Vec box = load(lighting.catch_light), side = unit(cross(box, Vec{0, 1, 0})), top = cross(side, box);
+        const float inside = dot(mirror, box) > 0 ? smoothstep(0.20f, 0.16f, std::abs(dot(mirror, side))) * smoothstep(0.26f, 0.22f, std::abs(dot(mirror, top))) : 0.0f;
+        const float glint = 1.15f * inside * r.cornea[i] * clamp(ao * 1.3f - 0.2f, 0.0f, 1.0f);
+        for (int k = 0; k < 3; ++k) r.reflection[k][i] = r.reflection[k][i] * 0.25f + glint;
+    }
+}
+
+}  // namespace
+
+// face, depth: (samples height, samples width) visibility; map: the shadow map of `light`, or null; planes: PLANES x
+// height x width; near: (height, width) depth of the scattering surface. Row by row, so threads do not matter.
+void shade(const Mesh &mesh, const Part *parts, const View &view, const Lighting &lighting, const Quality &quality,
+           const int32_t *face, const float *depth, const View &light, const float *map, float *planes, float *near,
+           int threads) {
+    const int width = view.width, height = view.height;
+    const int64_t area = int64_t(width) * height;
+    const Eye eye(view);
+#pragma omp parallel num_threads(threads)
+    {
+        Fragments r(width * quality.samples * quality.samples);
+#pragma omp for schedule(dynamic, 4)
+        for (int y = 0; y < height; ++y) {
+            const int64_t row = int64_t(y) * width;
+            for (int plane = 0; plane < PLANES; ++plane) std::fill(planes + plane * area + row, planes + plane * area + row + width, 0.0f);
+            std::fill(near + row, near + row + width, 1e6f);
+            const int n = gather(mesh, parts, eye, quality.samples, width, y, face, depth, r);
+            for (int i = 0; i < n; ++i) {
+                const Part &part = parts[r.part[i]];
+                material(mesh, part, quality, r, i);
+                const float wrap[3] = {part.kind == SKIN ? 0.20f : 0.05f, part.kind == SKIN ? 0.08f : 0.05f, 0.05f};
+                for (int k = 0; k < 3; ++k) r.wrap[k][i] = wrap[k];
+                if (quality.occlusion_taps > 0 && part.kind != EYE)
+                    r.occlusion[i] *= 0.5f + 0.5f * screen_occlusion(eye, quality, width, height, depth, r, i, y);
+                if (map) r.lit[i] = shadow(light, map, quality, r.get(r.position, i), r.get(r.normal, i), noise(r.pixel[i], y) * 2 * PI);
+            }
+            lights(lighting, parts, quality, r, n);
+            for (int i = 0; i < n; ++i) {
+                const int64_t at = row + r.pixel[i];
+                const float c = r.coverage[i];
+                planes[OPACITY * area + at] += c;
+                const bool scatter = quality.scatter && parts[r.part[i]].scatter;
+                if (scatter) planes[SCATTER * area + at] += c, near[at] = std::min(near[at], r.depth[i]);
+                for (int k = 0; k < 3; ++k) {
+                    const float shine = std::min(r.reflection[k][i], 8.0f);
+                    if (scatter) {
+                        planes[(ALBEDO + k) * area + at] += c * r.albedo[k][i];
+                        planes[(IRRADIANCE + k) * area + at] += c * r.irradiance[k][i];
+                        planes[(LIGHT + k) * area + at] += c * shine;
+                    } else {
+                        planes[(LIGHT + k) * area + at] += c * (r.albedo[k][i] * r.irradiance[k][i] + shine);
+                    }
+                }
+            }
+        }
+    }
+}
+
+}  // namespace MESHANIM_NAMESPACE
