@@ -201,6 +201,14 @@ def load_encoder(name: str = "visemes") -> SpeechEncoder:
     kind, _, path = name.partition(":")
     if kind == "mel" and not path:
         return MelEncoder()
+    if name == "visemes":
+        from meshanim.audio.visemes import VisemeEncoder
+
+        return VisemeEncoder()
+    if name in ("phones", "visemes+phones"):
+        from meshanim.audio.phones import FusedEncoder, PhoneEncoder
+
+        return PhoneEncoder() if name == "phones" else FusedEncoder()
     if kind == "features" and path:
         file, _, rate = path.rpartition("@") if "@" in path else (path, "", "60")
         try:
