@@ -44,6 +44,9 @@ def main(arguments: list[str] | None = None) -> int:
             raise
         print(f"meshanim: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
+    except BrokenPipeError:  # the reader of a pipe has seen enough
+        sys.stdout = None
+        return 0
     except KeyboardInterrupt:
         return 130
 
