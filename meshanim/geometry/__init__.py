@@ -1,7 +1,9 @@
 """Meshes and the operators on them."""
 
+from meshanim.geometry.alignment import Similarity, align
 from meshanim.geometry.closest_points import SurfacePoints, closest_points
 from meshanim.geometry.decimation import Decimation, Prolongation, decimate, prolongation
+from meshanim.geometry.deformation import DeformationTransfer, deformation_gradients
 from meshanim.geometry.frames import TriangleFrames, triangle_frames
 from meshanim.geometry.geodesics import HeatGeodesics
 from meshanim.geometry.laplacian import cotangent_laplacian, vertex_masses
@@ -14,19 +16,23 @@ from meshanim.geometry.uv import rasterize_uv
 
 __all__ = [
     "Decimation",
+    "DeformationTransfer",
     "HeatGeodesics",
     "Prolongation",
+    "Similarity",
     "SparseOperator",
     "Subdivision",
     "SurfacePoints",
     "TriangleFrames",
     "TriangleMesh",
+    "align",
     "bilinear_operator",
     "carry",
     "catmull_clark_operator",
     "closest_points",
     "cotangent_laplacian",
     "decimate",
+    "deformation_gradients",
     "face_normals",
     "prolongation",
     "rasterize_uv",
