@@ -29,10 +29,10 @@ _CLOSED_SHARE = {"P": 0.80, "B": 0.90, "M": 1.0}
 """Share of a bilabial that is closed; the rest of P and B is burst and breath."""
 _LABIODENTAL = {
     "jawOpen": 0.02,
-    "mouthRollLower": 0.42,
-    "mouthShrugLower": 0.20,
-    "mouthUpperUp": 0.55,
-    "mouthClose": 0.03,
+    "mouthRollLower": 0.90,
+    "mouthShrugLower": 0.10,
+    "mouthPress": 0.20,
+    "mouthUpperUp": 0.50,
 }
 _SEALED_JAW = 0.12
 
@@ -235,7 +235,7 @@ def articulate(
     loudness: Float[np.ndarray, " times"],
     accent: Float[np.ndarray, " times"],
     style: SpeakingStyle,
-    closing: float = 0.02,
+    closing: float = 0.0,
 ) -> tuple[dict[str, np.ndarray], Float[np.ndarray, " frames"], Float[np.ndarray, " frames"]]:
     """Mouth and jaw at the given times.
 
@@ -250,7 +250,7 @@ def articulate(
     style : SpeakingStyle
         Gains.
     closing : float
-        What mouthClose needs beyond jawOpen to bring the lips of this identity together.
+        What mouthClose needs beyond jawOpen to bring the lips together, where the head has no lipSeal.
 
     Returns
     -------

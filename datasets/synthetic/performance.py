@@ -144,7 +144,7 @@ def perform(
     style: SpeakingStyle | None = None,
     emotion_name: str = "neutral",
     intensity: float = 1.0,
-    closing: float = 0.02,
+    closing: float = 0.0,
     seed: int = 0,
 ) -> Performance:
     """Act out timed phonemes.
@@ -171,7 +171,8 @@ def perform(
     intensity : float
         Of the emotion, 0 to 1.
     closing : float
-        What mouthClose needs beyond jawOpen to close the lips of the identity that will be moved.
+        What mouthClose needs beyond jawOpen to close the lips of the head that will be moved; 0 where lipSeal
+        does it, as on the default head.
     seed : int
         Of everything left to chance: blinks, gaze, wandering of head and brows. The same seed gives the same
         motion in time at every frame rate.

@@ -14,6 +14,7 @@ __all__ = ["main"]
 # A verb's module has COMMANDS: its command, or a mapping from the second word to one. A command is a function
 # of one frozen dataclass, whose docstring and field comments are the help.
 VERBS = {
+    "data": "data sets: synthesize, check",
     "doctor": "what is installed, which backends work, how to get what is missing",
 }
 Command = Callable[[Any], object]

@@ -15,8 +15,8 @@ from meshanim.errors import OptionError
 
 __all__ = ["GAZE_RANGE", "IdleMotion", "gaze_weights", "lid_closure", "saccade", "smoothstep"]
 
-GAZE_RANGE = 0.45
-"""Radians that an eye turns at an eyeLook weight of 1."""
+GAZE_RANGE = (0.17, 0.235)
+"""Radians that an eye of the default head turns at an eyeLook weight of 1: up or down, and sideways."""
 
 _SWAY = (0.013, 0.024, 0.013)
 """Radians: deviation of nodding, turning and tilting."""
@@ -50,8 +50,9 @@ def gaze_weights(
     pitch: Float[np.ndarray, " frames"], yaw: Float[np.ndarray, " frames"]
 ) -> dict[str, Float[np.ndarray, " frames"]]:
     """ARKit's eight eyeLook weights for a gaze: pitch positive looks down, yaw to the subject's left."""
-    left, right = np.clip(yaw / GAZE_RANGE, 0, 1), np.clip(-yaw / GAZE_RANGE, 0, 1)
-    down, up = np.clip(pitch / GAZE_RANGE, 0, 1), np.clip(-pitch / GAZE_RANGE, 0, 1)
+    pitch, yaw = pitch / GAZE_RANGE[0], yaw / GAZE_RANGE[1]
+    left, right = np.clip(yaw, 0, 1), np.clip(-yaw, 0, 1)
+    down, up = np.clip(pitch, 0, 1), np.clip(-pitch, 0, 1)
     return {
         "eyeLookOutLeft": left,
         "eyeLookInRight": left,
@@ -129,7 +130,7 @@ class IdleMotion:
             step = saccade(times - moment, float(np.hypot(there[0] - here[0], there[1] - here[1])))
             pitch += (there[0] - here[0]) * step
             yaw += (there[1] - here[1]) * step
-        lids = 1 - (1 - lids) * (1 - 0.25 * np.clip(pitch / GAZE_RANGE, 0, 1))  # lids follow a downward gaze
+        lids = 1 - (1 - lids) * (1 - 0.25 * np.clip(pitch / 0.45, 0, 1))  # lids follow a downward gaze
         look = gaze_weights(pitch - 0.85 * head[:, 0], yaw - 0.85 * head[:, 1])
         return {"eyeBlinkLeft": lids, "eyeBlinkRight": lids, **look}
 

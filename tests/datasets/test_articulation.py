@@ -80,7 +80,7 @@ def test_contacts_and_ranges(phonemes, fps, style, emotion, seed):
         closed = near & (performance.seal == 1)
         assert closed.any()
         assert np.all(performance.seal[(times >= start) & (times <= end)] == 1) or not closed.all()
-        assert np.allclose(close[closed], jaw[closed] + 0.02, atol=1e-6)
+        assert np.allclose(close[closed], jaw[closed], atol=1e-6)
         assert np.all(performance.curve("lipSeal")[closed] == 1)
         for name in ("mouthLowerDownLeft", "mouthUpperUpRight", "tongueOut", "mouthFunnel"):
             assert np.abs(performance.curve(name)[closed]).max() < 1e-6

@@ -28,9 +28,9 @@ def test_a_saccade_lasts_as_long_as_carpenter_measured(degrees):
 
 def test_gaze_weights_turn_both_eyes_the_same_way():
     weights = gaze_weights(np.array([0.1]), np.array([0.2]))  # down, to the subject's left
-    assert weights["eyeLookOutLeft"] == weights["eyeLookInRight"] == pytest.approx(0.2 / GAZE_RANGE)
+    assert weights["eyeLookOutLeft"] == weights["eyeLookInRight"] == pytest.approx(0.2 / GAZE_RANGE[1])
     assert weights["eyeLookInLeft"] == weights["eyeLookUpLeft"] == 0
-    assert weights["eyeLookDownRight"] == pytest.approx(0.1 / GAZE_RANGE)
+    assert weights["eyeLookDownRight"] == pytest.approx(0.1 / GAZE_RANGE[0])
 
 
 def test_blinks_come_at_the_asked_rate_and_never_without_pause():
@@ -74,7 +74,7 @@ def test_eyes_hold_their_gaze_while_the_head_turns():
     turn = np.stack([0 * at, 0.1 * np.sin(at), 0 * at], 1)
     still = IdleMotion(seed=2, blinks=0, gaze=0)
     weights = still.weights(at, turn)
-    yaw = (weights["eyeLookOutLeft"] - weights["eyeLookInLeft"]) * GAZE_RANGE
+    yaw = (weights["eyeLookOutLeft"] - weights["eyeLookInLeft"]) * GAZE_RANGE[1]
     np.testing.assert_allclose(yaw, -0.85 * turn[:, 1], atol=1e-9)
 
 
