@@ -3,6 +3,7 @@
 from meshanim.render.look.appearance import SKIN_CHANNELS, Appearance, make_appearance
 from meshanim.render.look.assets import LookAssets, look_assets
 from meshanim.render.look.eyes import Eye, EyeMaterial, eye_mesh, pose_eye
+from meshanim.render.look.people import PEOPLE, find_person
 from meshanim.render.look.person import PersonParameters
 from meshanim.render.look.strands import Strands, strand_points
 from meshanim.render.look.surface import Surface
@@ -10,6 +11,7 @@ from meshanim.render.look.teeth import Teeth, pose_teeth
 from meshanim.render.look.wrinkles import Wrinkles, wrinkle_height
 
 __all__ = [
+    "PEOPLE",
     "SKIN_CHANNELS",
     "Appearance",
     "Eye",
@@ -21,6 +23,7 @@ __all__ = [
     "Teeth",
     "Wrinkles",
     "eye_mesh",
+    "find_person",
     "look_assets",
     "make_appearance",
     "pose_eye",

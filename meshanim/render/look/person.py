@@ -47,6 +47,8 @@ _RANGES: dict[str, tuple[float, float]] = {
     "hair_length": (0.002, 0.2),
     "hair_grey": (0.0, 1.0),
     "baldness": (0.0, 1.0),
+    "part_side": (-0.05, 0.05),
+    "fringe": (0.0, 1.0),
     "stubble": (0.0, 1.0),
     "beard_length": (0.0, 0.04),
     "tooth_yellow": (0.0, 1.0),
@@ -84,7 +86,7 @@ class PersonParameters:
     oil : float
         Shine of forehead, nose and chin, 0 to 1.
     masculinity : float
-        0 to 1, of the look alone (lash length and density); the shape has its own coefficients.
+        0 to 1, of the look alone (lashes, sideburns); the shape has its own coefficients.
     lip_color, lip_amount : tuple of float, float
         A lip colour and how much of it covers the natural one, 0 to 1.
     liner : float
@@ -104,6 +106,8 @@ class PersonParameters:
         Recession of the hairline, 0 to 1.
     part_side : float
         Where the parting lies, metres to the subject's left (+) or right (-) of the middle.
+    fringe : float
+        Share of the hair over the forehead that falls onto it, 0 to 1 (bob and long hair).
     stubble : float
         Density of beard hair and of its shadow in the skin, 0 to 1.
     beard_length : float
@@ -145,6 +149,7 @@ class PersonParameters:
     hair_grey: float = 0.0
     baldness: float = 0.0
     part_side: float = 0.02
+    fringe: float = 0.0
     stubble: float = 0.0
     beard_length: float = 0.0
     eye_color: str = "brown"

@@ -11,18 +11,25 @@ Points = Float[np.ndarray, "points 3"]
 Mask = Float[np.ndarray, " points"]
 
 
-def hairline(points: Points, baldness: float = 0.0) -> Mask:
+def hairline(points: Points, baldness: float = 0.0, sideburns: float = 0.5) -> Mask:
     """Signed distance in about millimetres, positive where scalp hair grows.
 
     The union of the top of the head above a frontal arc, the side behind the temple, the sideburn and the
     back down to the nape.
+
+    Parameters
+    ----------
+    points : (n, 3) float
+        Paint space, millimetres.
+    baldness, sideburns : float
+        0 to 1: recession of the arc; width and length of the sideburns.
     """
     x, y, z = np.abs(points[:, 0]), points[:, 1], points[:, 2]
     arc = 95 - 0.2 * x + 10 * np.exp(-(((x - 45) / 12) ** 2))
     arc = arc + baldness * (20 + 30 * np.exp(-((x / 30) ** 2)))
     top = np.minimum(y - arc - 0.1 * np.clip(z - 22, 0, None), 3 * (28 - z) + 50)
     side = np.minimum(0.9 * (-z - 8) + 0.25 * (y - 50), y - 22)
-    burn = np.minimum(9 - np.abs(z + 17 - 0.05 * (y - 20)), y + 4)
+    burn = np.minimum(3 + 6 * sideburns - np.abs(z + 17 - 0.05 * (y - 20)), y + 4 - 14 * (1 - sideburns))
     burn = np.where(x > 60, burn, -1000)
     back = np.minimum(-z - 62, y + 38 - 0.3 * np.clip(z + 130, 0, None))
     return np.maximum.reduce([top, side, burn, back])
@@ -42,7 +49,7 @@ def beard_mask(points: Points) -> Mask:
 def brow_curve(along: np.ndarray, arch: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     """Middle line (x, y) of the left brow, millimetres, from its inner end (0) to its tail (1)."""
     x = np.interp(along, [0, 0.25, 0.55, 0.8, 1], [10.5, 21, 36, 46.5, 54.5])
-    y = np.interp(along, [0, 0.25, 0.55, 0.72, 1], [48.5, 52, 56.2, 56.0, 49.0])
+    y = np.interp(along, [0, 0.25, 0.55, 0.72, 1], [50.0, 52.8, 56.0, 55.6, 49.5])
     return x, 51 + (y - 51) * np.where(along < 0.9, 0.5 + 0.5 * arch, 1)
 
 

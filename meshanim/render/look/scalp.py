@@ -16,7 +16,7 @@ from meshanim.render.look.strands import Strands
 __all__ = ["scalp_hair"]
 
 WHORL = np.array([4.0, 145.0, -80.0])
-BUN = np.array([0.0, 112.0, -152.0])
+BUN = np.array([0.0, 158.0, -104.0])
 EAR = ((78, 14, -22), (16, 26, 20))
 
 Points = Float[np.ndarray, "strands 3"]
@@ -91,7 +91,17 @@ def _hanging(points: Points, roots: Points, person: PersonParameters) -> Points:
     inward = smoothstep(-30, -70, points[:, 1])[:, None] * np.stack(
         [-np.sign(points[:, 0]) * 0.35, 0 * sign, 0.1 + 0 * sign], axis=1
     )
-    return unit(_blend(across, unit(fall), low) + inward)
+    flow = unit(_blend(across, unit(fall), low) + inward)
+    fringe = _in_fringe(roots, person)
+    flow[fringe] = unit(np.array([0.0, -0.35, 1.0]) + points[fringe] * [0.006, 0, 0])
+    return flow
+
+
+def _in_fringe(roots: Points, person: PersonParameters) -> np.ndarray:
+    """Which strands fall over the forehead: an even draw from the front, fixed by the root's place."""
+    front = (np.abs(roots[:, 0]) < 46) & (roots[:, 2] > 0)
+    lot = np.modf(np.abs(np.sin(roots @ np.array([12.9898, 78.233, 37.719])) * 43758.5453))[0]
+    return front & (lot < person.fringe)
 
 
 def _tied(points: Points, roots: Points, person: PersonParameters) -> Points:
@@ -117,7 +127,9 @@ def _to_one_level(roots: Points, person: PersonParameters) -> np.ndarray:
     reach = np.sqrt(np.clip(1 - ((roots[:, 1] - 60) / 95) ** 2, 0, 1))
     over = np.where(roots[:, 1] > 60, 95 * (np.pi / 2 - np.arcsin(np.clip(reach, 0, 1))), 0)
     level = 60 - person.hair_length * 1000
-    return np.clip(over + np.minimum(roots[:, 1], 60) - level, 30, 400)
+    length = np.clip(over + np.minimum(roots[:, 1], 60) - level, 30, 400)
+    brows = np.clip(30 + 1.0 * (60 - np.minimum(roots[:, 2], 60)), 40, 95)
+    return np.where(_in_fringe(roots, person), brows, length)
 
 
 def _to_knot(roots: Points, person: PersonParameters) -> np.ndarray:
@@ -130,12 +142,12 @@ def _even(roots: Points, person: PersonParameters) -> np.ndarray:
 
 _STYLES = {
     "buzz": _Style(_cropped, _even, 30000, 2, 0.55, 0.0, 0.1, 0, 0.0, 0.0, 0.16),
-    "crop": _Style(_cropped, _short_sides, 20000, 5, 0.55, 5.0, 0.25, 700, 0.45, 0.9, 0.16),
-    "parted": _Style(_parted, _short_sides, 16000, 8, 0.7, 9.0, 0.15, 420, 0.6, 1.0, 0.17),
-    "curls": _Style(_outwards, _even, 13000, 9, 0.8, 2.0, 0.05, 900, 0.7, 1.5, 0.20, 2.2),
-    "bob": _Style(_hanging, _to_one_level, 12000, 12, 0.55, 11.0, 0.2, 330, 0.6, 2.2, 0.20, 0.0, 15.0),
-    "long": _Style(_hanging, _to_one_level, 12000, 14, 0.55, 11.0, 0.25, 260, 0.65, 3.0, 0.20, 0.0, 15.0),
-    "bun": _Style(_tied, _to_knot, 13000, 9, 0.25, 3.0, 0.0, 500, 0.3, 0.6, 0.19, 0.0, 5.0),
+    "crop": _Style(_cropped, _short_sides, 20000, 5, 0.55, 6.0, 0.25, 700, 0.45, 0.9, 0.16),
+    "parted": _Style(_parted, _short_sides, 16000, 8, 0.40, 7.0, 0.15, 420, 0.6, 1.0, 0.17),
+    "curls": _Style(_outwards, _even, 14000, 14, 0.8, 2.0, 0.05, 1400, 0.6, 1.0, 0.26, 3.4),
+    "bob": _Style(_hanging, _to_one_level, 13000, 12, 0.35, 9.0, 0.2, 330, 0.6, 2.0, 0.20, 0.0, 9.0),
+    "long": _Style(_hanging, _to_one_level, 13000, 14, 0.35, 9.0, 0.25, 260, 0.65, 3.0, 0.20, 0.0, 9.0),
+    "bun": _Style(_tied, _to_knot, 13000, 9, 0.25, 3.0, 0.0, 500, 0.3, 0.6, 0.19, 0.0, 4.0),
 }
 
 
@@ -161,7 +173,7 @@ def scalp_hair(
     texels = ground.sample(np.where(scalp > 0.15, scalp, 0), style.count, draws)
     roots = ground.points[texels].astype(float)
     length = style.length(roots, person) * draws.uniform(0.72, 1.06, len(roots))
-    edge = hairline(roots, person.baldness)
+    edge = hairline(roots, person.baldness, person.masculinity)
     length = length * (0.45 + 0.55 * smoothstep(-3, 9, edge)) if person.hair != "bun" else length
     points, normals = _trace(ground, style, roots, ground.atlas.normal[texels], length, person, draws)
     if style.locks:

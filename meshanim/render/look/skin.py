@@ -246,7 +246,7 @@ def _hair_shadow(canvas: _Canvas, albedo: np.ndarray) -> tuple[np.ndarray, np.nd
     hair = _grown(person)
     ears = canvas.atlas.masks["ears"]
     has_hair = float(person.hair != "none")
-    edge = hairline(canvas.points, person.baldness) + 5 * canvas.fine + 2 * canvas.grain
+    edge = hairline(canvas.points, person.baldness, person.masculinity) + 5 * canvas.fine + 2 * canvas.grain
     scalp = smoothstep(-6, 10, edge) * canvas.outer * (1 - ears) * has_hair
     if has_hair:
         scalp = scalp * _away_from_ears(canvas)
