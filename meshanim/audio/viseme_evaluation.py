@@ -25,7 +25,7 @@ __all__ = ["Clip", "degraded", "evaluate", "load_clips", "scores"]
 RATE = 50.0
 """Frames a second that are judged."""
 CONDITIONS = ("clean", "noise20", "noise10", "telephone", "room", "quiet")
-Labels = Int64[np.ndarray, " frames"]
+Labels = Int64[np.ndarray, " _"]
 Posteriors = Callable[
     [Waveform], tuple[Float32[np.ndarray, "frames phonemes"], Float32[np.ndarray, "frames visemes"]]
 ]

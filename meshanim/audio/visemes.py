@@ -189,12 +189,12 @@ class HiddenStream:
             if last:
                 joined = F.pad(joined, (0, layer.right))
             context = layer.left + layer.right
-            count = max(0, joined.shape[-1] - context + (layer.stride - 1 if last else 0)) // layer.stride
+            count = max(0, joined.shape[-1] - context + layer.stride - 1) // layer.stride
             self.kept[k] = joined[..., count * layer.stride :]
             if count == 0:
                 hidden = joined.new_zeros(1, self.net.config.width, 0)
             else:
-                hidden = layer(joined[..., : (count - 1) * layer.stride + layer.stride + context])
+                hidden = layer(joined[..., : (count - 1) * layer.stride + context + 1])
         return hidden
 
 
@@ -268,6 +268,8 @@ class VisemeEncoder(SpeechEncoder):
         return VisemeStream(self)
 
     def _read_out(self, hidden: Float32[Tensor, "1 width frames"]) -> Float32[Tensor, "frames dim"]:
+        if hidden.shape[-1] == 0:
+            return hidden.new_zeros(0, self.dim)
         if self.outputs == "hidden":
             return hidden[0].T.clone()
         transform = torch.softmax if self.outputs == "posteriors" else torch.log_softmax
@@ -291,7 +293,7 @@ class VisemeStream(EncoderStream):
     def finish(self) -> Float32[Tensor, "frames dim"]:
         return self._encode(self.mel.finish(), last=True)
 
-    def _encode(self, mel: Float32[Tensor, "frames bands"], last: bool) -> Float32[Tensor, "frames dim"]:
+    def _encode(self, mel: Float32[Tensor, "mel_frames bands"], last: bool) -> Float32[Tensor, "frames dim"]:
         normal = torch.from_numpy(self.normalize(mel.numpy()))
         return self.encoder._read_out(self.layers.push(normal.T[None], last))
 
