@@ -11,7 +11,6 @@ import soxr
 import torch
 from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
 from jaxtyping import Float, Float32
-from torch import Tensor
 
 from meshanim.audio import SpeechEncoder, Waveform, load_encoder, load_waveform
 from meshanim.audio.encoders import MelEncoder
@@ -27,6 +26,7 @@ from meshanim.motion.lip_seal import LipSeal
 
 __all__ = ["AnimationOptions", "AnimationStream", "Animator", "Frames"]
 
+Template = Float[np.ndarray, "vertices 3"]
 CHECKPOINTS = {"default": "gava-default"}
 
 
@@ -79,7 +79,7 @@ class AnimationStream:
     later sample can change it.
     """
 
-    def __init__(self, animator: "Animator", rate: int, options: AnimationOptions, shape: Tensor | None):
+    def __init__(self, animator: "Animator", rate: int, options: AnimationOptions, template: Template | None):
         encoder = animator.encoder
         self._animator, self.rate = animator, rate
         self._resample = (
@@ -89,12 +89,11 @@ class AnimationStream:
         )
         self._features = encoder.stream()
         self._mel = animator.mel.stream() if animator.model.config.pose else None
-        head, model = animator.model_head, animator.model
-        template = None if head is None else head.template(shape)[0]
-        seal = animator.lip_seal(shape) if options.seal else None
+        model = animator.model
+        seal = animator.lip_seal() if options.seal else None
         self._frames = GavaStream(
             model,
-            template=template,
+            template=None if template is None else torch.from_numpy(np.asarray(template, np.float32)),
             style=model.style_of(options.subject, options.emotion, options.intensity),
             fps=options.fps,
             seal=seal,
@@ -231,7 +230,7 @@ class Animator:
         """Which feature is the probability of p, b or m; None if the encoder has no such class."""
         return getattr(self.encoder, "bilabial", None)
 
-    def lip_seal(self, shape: Float[Tensor, "1 shape"] | None = None) -> LipSeal | None:
+    def lip_seal(self) -> LipSeal | None:
         """The seal of the network's head; None where the head names no lip pairs or the encoder no class."""
         pairs = getattr(self.model_head, "lip_pairs", None)
         if pairs is None or self.bilabial is None:
@@ -240,7 +239,7 @@ class Animator:
         return LipSeal(torch.as_tensor(np.asarray(pairs)), closing.reshape(-1, 3))
 
     def open(
-        self, rate: int = 16000, options: AnimationOptions | None = None, shape: Tensor | None = None
+        self, rate: int = 16000, options: AnimationOptions | None = None, template: Template | None = None
     ) -> AnimationStream:
         """Start a stream of speech.
 
@@ -250,20 +249,20 @@ class Animator:
             Samples a second of the blocks to come.
         options : AnimationOptions, optional
             How it is performed.
-        shape : (1, S), optional
-            Identity coefficients of the network's head.
+        template : (V, 3), optional
+            Who speaks: the face at rest, metres, in the network's topology; its own template if not given.
         """
-        return AnimationStream(self, rate, options or AnimationOptions(), shape)
+        return AnimationStream(self, rate, options or AnimationOptions(), template)
 
     def stream(
         self,
         blocks: Iterable[Float[np.ndarray, " samples"]],
         rate: int = 16000,
         options: AnimationOptions | None = None,
-        shape: Tensor | None = None,
+        template: Template | None = None,
     ) -> Iterator[Float32[np.ndarray, "frames vertices 3"]]:
         """Vertices (t, V, 3) in the zero pose while blocks of samples arrive; `open` gives the pose too."""
-        stream = self.open(rate, options, shape)
+        stream = self.open(rate, options, template)
         for block in blocks:
             frames = stream.push(block)
             if len(frames.pose):
@@ -276,7 +275,7 @@ class Animator:
         self,
         speech: str | Path | Waveform,
         options: AnimationOptions | None = None,
-        shape: Tensor | None = None,
+        template: Template | None = None,
     ) -> MeshSequence:
         """Animate a whole speech.
 
@@ -286,8 +285,8 @@ class Animator:
             Any format that libsndfile reads.
         options : AnimationOptions, optional
             How it is performed.
-        shape : (1, S), optional
-            Identity coefficients of the network's head.
+        template : (V, 3), optional
+            Who speaks: the face at rest, metres, in the network's topology; its own template if not given.
 
         Raises
         ------
@@ -295,7 +294,7 @@ class Animator:
             If the file is not sound, is empty or holds NaN.
         """
         waveform = speech if isinstance(speech, Waveform) else load_waveform(speech, rate=None)
-        stream = self.open(waveform.rate, options, shape)
+        stream = self.open(waveform.rate, options, template)
         block = max(1, waveform.rate)  # a second at a time: memory for the result only
         parts = [
             stream.push(waveform.samples[start : start + block])
@@ -305,8 +304,8 @@ class Animator:
         vertices = np.concatenate([part.vertices for part in parts])
         pose = np.concatenate([part.pose for part in parts])
         mesh = self.mesh
-        if shape is not None and self.retarget is None and self.model_head is not None:
-            mesh = mesh.with_vertices(self.model_head.template(shape)[0].numpy())
+        if template is not None and self.retarget is None:
+            mesh = mesh.with_vertices(template)
         return MeshSequence(vertices, stream.fps, mesh, pose, waveform)
 
     def finished(self, vertices: np.ndarray, weights) -> Float32[np.ndarray, "frames vertices 3"]:

@@ -5,12 +5,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Float
+from torch import Tensor
 
 from meshanim.audio import Waveform
 from meshanim.errors import FileFormatError, OptionError, ShapeError
 from meshanim.files import written_whole
 from meshanim.geometry import TriangleMesh
+from meshanim.heads import Head
 
 __all__ = ["MeshSequence"]
 
@@ -58,6 +61,25 @@ class MeshSequence:
     def duration(self) -> float:
         """Seconds."""
         return len(self.vertices) / self.fps
+
+    def posed(
+        self, head: Head, shape: Float[Tensor, "1 shape"] | None = None
+    ) -> Float[np.ndarray, "frames vertices 3"]:
+        """Vertices with the head turned about the neck joint, metres.
+
+        Parameters
+        ----------
+        head : Head
+            Whose topology this is.
+        shape : (1, S), optional
+            Identity, which places the neck joint.
+        """
+        parts = [
+            head.pose(torch.from_numpy(self.vertices[at]), torch.from_numpy(self.pose[at]), shape).numpy()
+            for start in range(0, len(self), 256)
+            for at in [slice(start, start + 256)]
+        ]
+        return np.concatenate(parts) if parts else self.vertices
 
     def save(self, path: str | Path) -> None:
         """Write an npz with `vertices` (T, V, 3), `faces` (F, 3), `fps`, `pose` (T, 3), `template` (V, 3).
