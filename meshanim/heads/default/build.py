@@ -153,11 +153,12 @@ def _place(uv: np.ndarray, uv_quads: np.ndarray, box: Sequence[float]) -> np.nda
 
 def principal_shapes(
     source: MakeHuman, rest: Float[np.ndarray, "vertices 3"], rows: Int[np.ndarray, " rows"]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Principal directions of the sampled adults about the average one.
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Principal directions of the sampled adults about their mean.
 
     Heads are brought together at the joint between neck and skull. Returns directions (S, rows, 3) in metres
-    a standard deviation, the samples' coefficients (samples, S) and the error of the cut in metres.
+    a standard deviation, the samples' coefficients (samples, S) from `rest`, which is not the mean, and the
+    error of the cut in metres.
     """
     joint = source.bone_head_vertices("head")
     offsets = []
@@ -166,17 +167,15 @@ def principal_shapes(
         vertices += (rest[joint] - vertices[joint]).mean(0)
         offsets.append((vertices - rest)[rows])
     table = np.stack(offsets).reshape(SAMPLES, -1)
-    left, singular, directions = np.linalg.svd(table, full_matrices=False)
+    _, singular, directions = np.linalg.svd(table - table.mean(0), full_matrices=False)
     # The sign of a direction is free: the largest entry is positive, so that a rebuild gives the same file.
-    sign = np.sign(np.take_along_axis(directions, np.abs(directions).argmax(1)[:, None], axis=1))
-    deviation = singular[:COMPONENTS, None] / np.sqrt(SAMPLES)
-    coefficients = left[:, :COMPONENTS] * sign[:COMPONENTS, 0] * np.sqrt(SAMPLES)
-    error = np.sqrt((singular[COMPONENTS:] ** 2).sum() / SAMPLES / len(rows))
-    return (
-        (directions[:COMPONENTS] * sign[:COMPONENTS] * deviation).reshape(COMPONENTS, -1, 3),
-        coefficients,
-        error,
-    )
+    directions = directions[:COMPONENTS]
+    directions *= np.sign(np.take_along_axis(directions, np.abs(directions).argmax(1)[:, None], axis=1))
+    deviation = singular[:COMPONENTS] / np.sqrt(SAMPLES)
+    coefficients = table @ directions.T / deviation
+    left_over = table - (coefficients * deviation) @ directions
+    error = float(np.sqrt((left_over**2).sum() / SAMPLES / len(rows)))
+    return (directions * deviation[:, None]).reshape(COMPONENTS, -1, 3), coefficients, error
 
 
 def joint_weights(source: MakeHuman, rows: np.ndarray) -> Float[np.ndarray, "vertices 5"]:
@@ -263,6 +262,7 @@ def main() -> None:
         "expressions": quantised(expressions, EXPRESSION_STEP),
         "expression_step": np.array(EXPRESSION_STEP),
         "shapes": quantised(directions[:, :n], SHAPE_STEP),
+        "shape_mean": coefficients.mean(0).astype(np.float32),
         "shape_step": np.array(SHAPE_STEP),
         "joints": np.array(joints, np.float32),
         "joint_shapes": np.array(joint_directions, np.float32),

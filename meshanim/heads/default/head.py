@@ -115,6 +115,8 @@ class DefaultHead(Head):
         self.lip_pairs = arrays["lip_pairs"].astype(np.int64)
         self.neck_loop = arrays["neck_loop"].astype(np.int64)
         self.people = {str(name): row for name, row in zip(arrays["people_names"], arrays["people_shapes"])}
+        self.shape_mean: Tensor
+        self.register_buffer("shape_mean", torch.from_numpy(arrays["shape_mean"]), persistent=False)
         self.seal_vertices: Tensor
         self.seal_directions: Tensor
         self.register_buffer(
@@ -123,6 +125,17 @@ class DefaultHead(Head):
         self.register_buffer(
             "seal_directions", torch.from_numpy(seal[1:].reshape(len(seal) - 1, -1)), persistent=False
         )
+
+    def sample_shapes(
+        self, count: int, generator: torch.Generator | None = None
+    ) -> Float[Tensor, "count shape"]:
+        """Random adults: shape coefficients, independent and normal about the mean adult.
+
+        The template (all coefficients zero) is MakeHuman's average adult, 2.4 mm rms from the mean of the
+        sampled ones.
+        """
+        drawn = torch.randn(count, len(self.shape_names), generator=generator)
+        return drawn.to(self.shape_mean) + self.shape_mean
 
     def person(self, name: str) -> Float[Tensor, "1 shape"]:
         """Shape coefficients of one of `people`.
