@@ -99,14 +99,14 @@ def test_jaw_rotation_and_jaw_open_both_lower_the_chin(head):
 
 
 def test_the_seal_closes_the_middle_of_every_mouth(head):
-    shape = torch.randn(50, len(head.shape_names), generator=torch.Generator().manual_seed(1))
+    shape = head.sample_shapes(50, torch.Generator().manual_seed(1))
     upper, lower = torch.from_numpy(head.lip_pairs).T
     for jaw in (0.0, 0.1, 0.3):
         weights = {"jawOpen": jaw, "mouthClose": jaw, "lipSeal": 1.0}
         vertices = head(HeadParameters(shape=shape, expression=head.expression(weights)))
         gap = vertices[:, upper, 1] - vertices[:, lower, 1]
         assert gap.mean(1).max() < 0
-        assert gap.mean(1).min() > -0.002
+        assert gap.mean(1).min() > -0.0025
     delta = head.seal(shape)
     change = head.deform(shape, head.expression({"lipSeal": 1.0})) - head.deform(shape)
     torch.testing.assert_close(change, delta, atol=1e-7, rtol=0)
@@ -123,3 +123,19 @@ def test_wrong_names_and_widths_are_named(head):
         head(HeadParameters(shape=torch.zeros(2, 3), jaw=torch.zeros(3, 3)))
     with pytest.raises(OptionError, match="default"):
         load_head("nothing")
+
+
+def test_a_dozen_people_differ(head):
+    assert len(head.people) == 12
+    faces = head.template(torch.cat([head.person(name) for name in head.people]))[:, head.regions["face"]]
+    faces = faces - faces.mean(1, keepdim=True)
+    distance = (faces[:, None] - faces[None]).square().sum(-1).mean(-1).sqrt()
+    assert distance[~torch.eye(12, dtype=bool)].min() > 0.003
+
+
+def test_the_mean_person_is_a_small_step_from_the_template(head):
+    step = head.template(head.shape_mean[None])[0] - head.template_vertices
+    assert 0.001 < step.square().sum(-1).mean().sqrt() < 0.004
+    sampled = head.sample_shapes(4000, torch.Generator().manual_seed(0))
+    torch.testing.assert_close(sampled.mean(0), head.shape_mean, atol=0.08, rtol=0)
+    torch.testing.assert_close(sampled.std(0), torch.ones(sampled.shape[1]), atol=0.08, rtol=0)

@@ -15,8 +15,9 @@ from meshanim.heads.default.crop import edge_loop
 
 __all__ = ["LipLine", "lip_line", "seal_directions"]
 
-# Vertical overlap of the sealed lips, metres, at the middle of the mouth and at its corners.
-OVERLAP = (0.0004, 0.0008)
+# Vertical overlap of the sealed lips, metres: with 1.0 mm nothing of the mouth's inside is seen on any of 60
+# people; with 0.4 mm, up to 6 square millimetres.
+OVERLAP = 0.001
 # The closing is shared between the lips: the lower one moves more.
 LOWER_SHARE = 0.6
 # Full within the first distance (metres) of the line of contact, then a Gaussian of the second.
@@ -103,7 +104,7 @@ def seal_directions(
             for heights in closed
         ]
     )
-    opening[0] += OVERLAP[0] + (OVERLAP[1] - OVERLAP[0]) * np.abs(columns / half) ** 4
+    opening[0] += OVERLAP
 
     contact = (np.interp(x, x[upper], y[upper]) + np.interp(x, x[lower], y[lower])) / 2
     fall = np.exp(-((np.maximum(np.abs(y - contact) - FALL_OFF[0], 0) / FALL_OFF[1]) ** 2))
