@@ -209,10 +209,23 @@ def load_encoder(name: str = "visemes") -> SpeechEncoder:
         from meshanim.audio.phones import FusedEncoder, PhoneEncoder
 
         return PhoneEncoder() if name == "phones" else FusedEncoder()
-    if kind == "features" and path:
-        file, _, rate = path.rpartition("@") if "@" in path else (path, "", "60")
+    if kind in ("wav2vec2", "hubert") and path:
+        from meshanim.audio.pretrained import TransformerEncoder
+
+        source, at, layer = path.rpartition("@")
+        if not at:
+            return TransformerEncoder(kind, path)
         try:
-            return FileFeatures(file, float(rate))
+            return TransformerEncoder(kind, source, int(layer))
+        except ValueError as error:
+            raise OptionError(f"{name}: {layer!r} is not a layer; expected {kind}:PATH@LAYER") from error
+    if kind == "features" and path:
+        file, at, rate = path.rpartition("@")
+        try:
+            return FileFeatures(file, float(rate)) if at else FileFeatures(path)
         except ValueError as error:
             raise OptionError(f"{name}: {rate!r} is not a frame rate; expected features:FILE@RATE") from error
-    raise OptionError(f"no encoder {name!r}; expected mel or features:FILE")
+    raise OptionError(
+        f"no encoder {name!r}; expected visemes, mel, phones, visemes+phones, wav2vec2:PATH, hubert:PATH "
+        "or features:FILE"
+    )

@@ -6,10 +6,9 @@ Voices made from recordings of people (flite, Pico) carry most of it; espeak-ng'
 import random
 import re
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import repeat
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -190,10 +189,16 @@ def speak_corpus(folder: str | Path, hours: float = 3.0, seed: int = 0, processe
         for index in range(int(np.ceil(seconds / _SHARD_SECONDS - 1e-9))):
             if not (folder / f"{family}-{index:03d}.npz").exists():
                 jobs.append((family, index, min(_SHARD_SECONDS, seconds - index * _SHARD_SECONDS)))
-    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-        done = pool.map(_speak_shard, repeat(folder), *zip(*jobs), repeat(seed)) if jobs else iter(())
-        for _ in tqdm(done, total=len(jobs), desc="speak", unit="shard"):
-            pass
+    with tqdm(total=len(jobs), desc="speak", unit="shard") as progress:
+        if processes == 1:
+            for job in jobs:
+                _speak_shard(folder, *job, seed)
+                progress.update()
+            return
+        with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+            for done in as_completed([pool.submit(_speak_shard, folder, *job, seed) for job in jobs]):
+                done.result()
+                progress.update()
 
 
 def load_corpus(folder: str | Path) -> list[Utterance]:
