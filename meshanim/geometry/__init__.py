@@ -2,6 +2,7 @@
 
 from meshanim.geometry.alignment import Similarity, align
 from meshanim.geometry.closest_points import SurfacePoints, closest_points
+from meshanim.geometry.correspondence import SurfaceCorrespondence, surface_correspondence
 from meshanim.geometry.decimation import Decimation, Prolongation, decimate, prolongation
 from meshanim.geometry.deformation import DeformationTransfer, deformation_gradients
 from meshanim.geometry.frames import TriangleFrames, triangle_frames
@@ -10,6 +11,7 @@ from meshanim.geometry.laplacian import cotangent_laplacian, vertex_masses
 from meshanim.geometry.mesh import TriangleMesh
 from meshanim.geometry.normals import face_normals, vertex_normals
 from meshanim.geometry.quad_subdivision import bilinear_operator, catmull_clark_operator
+from meshanim.geometry.repair import Repair, repair
 from meshanim.geometry.subdivision import Subdivision, split_faces, subdivide
 from meshanim.geometry.transfer import SparseOperator, carry, transfer_operator
 from meshanim.geometry.uv import rasterize_uv
@@ -19,9 +21,11 @@ __all__ = [
     "DeformationTransfer",
     "HeatGeodesics",
     "Prolongation",
+    "Repair",
     "Similarity",
     "SparseOperator",
     "Subdivision",
+    "SurfaceCorrespondence",
     "SurfacePoints",
     "TriangleFrames",
     "TriangleMesh",
@@ -36,8 +40,10 @@ __all__ = [
     "face_normals",
     "prolongation",
     "rasterize_uv",
+    "repair",
     "split_faces",
     "subdivide",
+    "surface_correspondence",
     "transfer_operator",
     "triangle_frames",
     "vertex_masses",

@@ -10,6 +10,7 @@ import scipy.sparse as sp
 from meshanim.errors import MeshError, OptionError
 from meshanim.geometry.closest_points import barycentric_coordinates
 from meshanim.geometry.mesh import TriangleMesh
+from meshanim.geometry.topology import edge_uses
 from meshanim.geometry.transfer import barycentric_operator
 
 __all__ = ["Decimation", "Prolongation", "decimate", "prolongation"]
@@ -154,13 +155,26 @@ def _simplified(
         vertices, narrow, target_count=target, return_collapses=True
     )
     _, _, merged = fast_simplification.replay_simplification(vertices, narrow, collapses)
-    # Collapses of slivers and of non-manifold edges can leave triangles that repeat a vertex or each other.
-    triangles = triangles[(triangles != np.roll(triangles, 1, axis=1)).all(1)]
+    # In flat regions neighbours can be moved to one place; odd edges can leave triangles doubled.
+    points, triangles, welded = _without_zero_edges(points, triangles.astype(np.int64))
+    merged = welded[merged]
     _, first = np.unique(np.sort(triangles, axis=1), axis=0, return_index=True)
     triangles = triangles[np.sort(first)]
     if not len(triangles) or len(np.unique(triangles)) < len(points) or len(np.unique(merged)) < len(points):
         return vertices, faces, np.arange(len(vertices))
-    return points, triangles.astype(np.int64), merged.astype(np.int64)
+    return points, triangles, merged
+
+
+def _without_zero_edges(points: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Contract edges of next to no length; also returns the new vertex of each old one."""
+    edges, _ = edge_uses(faces)
+    length = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
+    zero = edges[length < 1e-6 * np.ptp(points, axis=0).max()]
+    graph = sp.csr_array((np.ones(len(zero)), zero.T), shape=(len(points), len(points)))
+    _, label = sp.csgraph.connected_components(graph, directed=False)
+    _, first, label = np.unique(label, return_index=True, return_inverse=True)
+    faces = label.ravel()[faces]
+    return points[first], faces[(faces != np.roll(faces, 1, axis=1)).all(1)], label.ravel()
 
 
 def _touching(cluster: np.ndarray, faces: np.ndarray, n_clusters: int) -> sp.csr_array:
