@@ -102,7 +102,7 @@ def hair_colors(
     pigment = srgb_to_linear(person.hair_color if color is None else color) * darken
     colors = pigment * draws.uniform(0.72, 1.28, (count, 1)) * draws.uniform(0.94, 1.06, (count, 3))
     grey = draws.uniform(size=count) < person.hair_grey
-    colors[grey] = draws.uniform(0.30, 0.52, (grey.sum(), 1)) * np.array([1.0, 0.99, 0.96])
+    colors[grey] = draws.uniform(0.16, 0.44, (grey.sum(), 1)) * np.array([1.0, 0.965, 0.90])
     return colors
 
 

@@ -89,11 +89,11 @@ def lash_strands(
     groups = []
     for guide in guides:
         count = round((84 if guide.upper else 42) * thick)
-        along = np.sort(draws.uniform(0.03, 0.97, count))
+        along = np.sort(draws.uniform(0.05, 0.93, count))
         root, tip = guide.at(guide.inner + along * (guide.outer - guide.inner))
         texel = lid[tree.query(root)[1]]
         direction = unit(tip - root)
-        direction[:, 0] += guide.side * 0.9 * (along - 0.42) + draws.normal(0, 0.10, count)
+        direction[:, 0] += guide.side * 0.75 * (along - 0.45) + draws.normal(0, 0.08, count)
         direction = unit(direction)
         swell = 0.55 + 0.45 * np.sin(np.pi * np.clip(0.8 * along + 0.15, 0, 1))
         length = (7.5 if guide.upper else 4.2) * long * swell * draws.uniform(0.75, 1.1, count)

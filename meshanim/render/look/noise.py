@@ -3,8 +3,11 @@
 from functools import cache
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from scipy.ndimage import gaussian_filter, map_coordinates
+
+from meshanim.render.rasterizer import native_available
 
 __all__ = ["lattice", "value_noise"]
 
@@ -47,13 +50,26 @@ def value_noise(
     -------
     (n,) float32
     """
-    shifts = np.random.default_rng(seed).uniform(0, SIZE, (octaves, 3)).astype(np.float32)
-    total = np.zeros(len(positions), np.float32)
-    weight, power = 1.0, 0.0
-    for octave in range(octaves):
-        scale = np.asarray(stretch, np.float32) * np.float32(2**octave / cell)
-        points = positions.astype(np.float32, copy=False) * scale + shifts[octave]
-        total += np.float32(weight) * map_coordinates(lattice(), points.T, order=1, mode="grid-wrap")
-        power += weight * weight
-        weight *= 0.55
-    return total / np.float32(np.sqrt(power))
+    weight = 0.55 ** np.arange(octaves)
+    weight = (weight / np.linalg.norm(weight)).astype(np.float32)
+    scale = np.outer(2.0 ** np.arange(octaves) / cell, stretch).astype(np.float32)
+    shift = np.random.default_rng(seed).uniform(0, SIZE, (octaves, 3)).astype(np.float32)
+    points = np.ascontiguousarray(positions, np.float32)
+    evaluate = _native if native_available() else _reference
+    return evaluate(points, scale, shift, weight)
+
+
+def _native(points: np.ndarray, scale: np.ndarray, shift: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    from meshanim import _native as kernels
+
+    total = np.empty(len(points), np.float32)
+    kernels.value_noise(points, lattice(), scale, shift, weight, total, torch.get_num_threads())
+    return total
+
+
+def _reference(points: np.ndarray, scale: np.ndarray, shift: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    total = np.zeros(len(points), np.float32)
+    for octave in range(len(weight)):
+        at = points * scale[octave] + shift[octave]
+        total += weight[octave] * map_coordinates(lattice(), at.T, order=1, mode="grid-wrap")
+    return total

@@ -93,13 +93,15 @@ def _hanging(points: Points, roots: Points, person: PersonParameters) -> Points:
     )
     flow = unit(_blend(across, unit(fall), low) + inward)
     fringe = _in_fringe(roots, person)
-    flow[fringe] = unit(np.array([0.0, -0.35, 1.0]) + points[fringe] * [0.006, 0, 0])
+    if fringe.any():
+        ahead, fall = np.array([[0.0, -0.1, 1.0]]), np.array([[0.0, -1.0, 0.12]])
+        flow[fringe] = unit(_blend(ahead, fall, smoothstep(122, 100, points[fringe, 1])))
     return flow
 
 
 def _in_fringe(roots: Points, person: PersonParameters) -> np.ndarray:
     """Which strands fall over the forehead: an even draw from the front, fixed by the root's place."""
-    front = (np.abs(roots[:, 0]) < 46) & (roots[:, 2] > 0)
+    front = (np.abs(roots[:, 0]) < 50) & (roots[:, 2] > -30) & (roots[:, 1] > 80)
     lot = np.modf(np.abs(np.sin(roots @ np.array([12.9898, 78.233, 37.719])) * 43758.5453))[0]
     return front & (lot < person.fringe)
 
@@ -128,7 +130,7 @@ def _to_one_level(roots: Points, person: PersonParameters) -> np.ndarray:
     over = np.where(roots[:, 1] > 60, 95 * (np.pi / 2 - np.arcsin(np.clip(reach, 0, 1))), 0)
     level = 60 - person.hair_length * 1000
     length = np.clip(over + np.minimum(roots[:, 1], 60) - level, 30, 400)
-    brows = np.clip(30 + 1.0 * (60 - np.minimum(roots[:, 2], 60)), 40, 95)
+    brows = np.clip(44 + 1.1 * (60 - np.minimum(roots[:, 2], 60)), 40, 150)
     return np.where(_in_fringe(roots, person), brows, length)
 
 
@@ -144,7 +146,7 @@ _STYLES = {
     "buzz": _Style(_cropped, _even, 30000, 2, 0.55, 0.0, 0.1, 0, 0.0, 0.0, 0.16),
     "crop": _Style(_cropped, _short_sides, 20000, 5, 0.55, 6.0, 0.25, 700, 0.45, 0.9, 0.16),
     "parted": _Style(_parted, _short_sides, 16000, 8, 0.40, 7.0, 0.15, 420, 0.6, 1.0, 0.17),
-    "curls": _Style(_outwards, _even, 14000, 14, 0.8, 2.0, 0.05, 1400, 0.6, 1.0, 0.26, 3.4),
+    "curls": _Style(_outwards, _even, 15000, 16, 0.6, 2.0, 0.05, 1800, 0.45, 2.5, 0.26, 3.8),
     "bob": _Style(_hanging, _to_one_level, 13000, 12, 0.35, 9.0, 0.2, 330, 0.6, 2.0, 0.20, 0.0, 9.0),
     "long": _Style(_hanging, _to_one_level, 13000, 14, 0.35, 9.0, 0.25, 260, 0.65, 3.0, 0.20, 0.0, 9.0),
     "bun": _Style(_tied, _to_knot, 13000, 9, 0.25, 3.0, 0.0, 500, 0.3, 0.6, 0.19, 0.0, 4.0),
@@ -271,7 +273,7 @@ def _curl(points: np.ndarray, style: _Style, draws: np.random.Generator) -> np.n
     across = unit(np.cross(forward, [0.3, 0.9, 0.2]))
     other = np.cross(forward, across)
     along = np.linspace(0, 1, points.shape[1])[None, :, None]
-    turns = draws.uniform(1.3, 2.2, (len(points), 1, 1)) * draws.choice([-1, 1], (len(points), 1, 1))
+    turns = draws.uniform(2.0, 3.2, (len(points), 1, 1)) * draws.choice([-1, 1], (len(points), 1, 1))
     angle = 2 * np.pi * turns * along + draws.uniform(0, 2 * np.pi, (len(points), 1, 1))
     radius = style.curl * draws.uniform(0.5, 1.3, (len(points), 1, 1)) * np.minimum(1, 3 * along)
     return points + radius * (np.cos(angle) * across + np.sin(angle) * other)

@@ -120,6 +120,9 @@ def paint_tongue(atlas: Atlas, person: PersonParameters, paint: SkinPaint) -> No
     coating = smoothstep(0.3, 0.9, atlas.normal[:, 1]) * smoothstep(55, 30, points[:, 2])
     albedo = srgb_to_linear((0.75, 0.39, 0.38)) * (1 + 0.10 * papillae + 0.12 * blotch)[:, None]
     albedo = albedo * (1 - 0.22 * groove[:, None]) * (1 + coating[:, None] * np.array([0.05, 0.25, 0.22]))
+    # Little light reaches the root of the tongue and its flanks beside the teeth.
+    albedo = albedo * (0.25 + 0.75 * smoothstep(8, 48, points[:, 2]))[:, None]
+    albedo = albedo * (0.55 + 0.45 * smoothstep(21, 12, np.abs(points[:, 0])))[:, None]
     paint.skin[atlas.active, :3] = np.clip(albedo, 0.002, 0.95)
     paint.skin[atlas.active, 3:] = np.array([0.32, 1.0, 0.85, 0.2, 0.6])
     paint.height[atlas.active] = 1.2e-4 * papillae * (1 - 0.5 * groove) - 4e-4 * groove
@@ -210,7 +213,9 @@ def _lips(canvas: _Canvas, albedo: np.ndarray, lines: np.ndarray) -> np.ndarray:
     shade = shade * (1 - 0.25 * canvas.lining)
     lips = canvas.lips[:, None]
     deep = smoothstep(55, -10, canvas.z)
-    flesh = np.array([0.36, 0.10, 0.09], np.float32) * ((1 + 0.25 * canvas.fine) * (1 - 0.75 * deep))[:, None]
+    flesh = (
+        np.array([0.32, 0.085, 0.08], np.float32) * ((1 + 0.25 * canvas.fine) * (1 - 0.75 * deep))[:, None]
+    )
     albedo = np.where(canvas.lining[:, None] > 0, flesh, albedo)
     albedo = albedo * (1 - lips) + (color.astype(np.float32) * shade[:, None]) * lips
     # the vermilion border catches light, fair skin only
@@ -269,7 +274,7 @@ def _hair_shadow(canvas: _Canvas, albedo: np.ndarray) -> tuple[np.ndarray, np.nd
 def _grown(person: PersonParameters) -> np.ndarray:
     """Mean linear colour of the hair, grey strands included."""
     pigment = srgb_to_linear(person.hair_color)
-    return (pigment * (1 - person.hair_grey) + 0.42 * person.hair_grey).astype(np.float32)
+    return (pigment * (1 - person.hair_grey) + 0.26 * person.hair_grey).astype(np.float32)
 
 
 def _away_from_ears(canvas: _Canvas) -> np.ndarray:
@@ -320,6 +325,23 @@ def _relief(
     zone = 0.5 + 0.9 * blob((20, 0, 60), (20, 13, 30)) + 0.5 * shiny
     zone = zone * (1 - lips) * canvas.face + 0.25 * canvas.outer * (1 - canvas.face)
     height = -1.1e-4 * pores * zone + 0.35e-4 * weave * (1 - 0.5 * lips) + 1.5e-4 * lip_lines * lips
-    height = height + 0.8e-4 * canvas.fine * person.age * (1 - lips)
+    height = height + (1 - lips) * (0.6e-4 * canvas.fine * person.age + person.age**2 * _sagging(canvas))
     height = np.where(canvas.lining > 0, 0.8e-4 * canvas.fine + 1.0e-4 * lip_lines * lips, height)
     return roughness, specular, np.where(canvas.socket > 0, 0, height)
+
+
+def _sagging(canvas: _Canvas) -> np.ndarray:
+    """Relief of old age that no expression drives: lines down from the mouth corners, rings of the neck."""
+    side, y = canvas.side, canvas.y
+    along = np.clip((-46 - y) / 26, -0.5, 1.5)
+    corner = smoothstep(-0.1, 0.2, along) * smoothstep(1.1, 0.6, along) * (canvas.z > 20)
+    lines = 5.5e-4 * corner * _valley(side - (25 + 4 * along + 0.5 * canvas.blotch), 1.8)
+    sway = y + 1.5 * canvas.broad + 2 * canvas.blotch
+    rings = sum(_valley(sway - level - 0.004 * side**2, 1.6) for level in (-96.0, -110.0, -121.0))
+    fold = 4e-4 * rings * smoothstep(-70, -40, canvas.z) * smoothstep(60, 35, side) * canvas.outer
+    bag = 4e-4 * canvas.blob((30, 17, 50), (11, 3, 20)) - 3e-4 * canvas.blob((30, 11, 50), (13, 2, 20))
+    return lines + fold + bag * canvas.face
+
+
+def _valley(distance: np.ndarray, width: float) -> np.ndarray:
+    return -np.exp(-((distance / width) ** 2))

@@ -110,7 +110,9 @@ def make_teeth(
     jitter = draws.normal(0, 0.00022, (2, 12))[:, tooth]
     vertices = arch(along)[:, None] * [1, 0, 1] + outward[:, None] * (out + jitter[0][:, None])[..., None]
     vertices[..., 2] -= 0.0012 * sign
-    level = np.interp(along, length, edge) + jitter[1]
+    # The strip climbs steeply at its ends; a dental arch hardly does (curve of Spee).
+    front = np.interp(0.0, length, edge)
+    level = front + 0.3 * (np.interp(along, length, edge) - front) + jitter[1]
     vertices[..., 1] = level[:, None] + sign * (drop - height[kind][:, None])
 
     columns, rows = vertices.shape[:2]

@@ -65,13 +65,13 @@ WRINKLE_GROUPS = tuple(WRINKLE_DRIVE)
 # Depth at full drive (millimetres; 1 mm on the forehead looks like corrugated plastic) and share of it that
 # the face of an old person keeps at rest.
 _DEPTH = {
-    "forehead": (0.50, 0.35),
-    "frown": (0.75, 0.40),
+    "forehead": (0.50, 0.65),
+    "frown": (0.75, 0.50),
     "nose": (0.50, 0.10),
-    "crow": (0.36, 0.70),
-    "nasolabial": (1.70, 0.45),
-    "dimple": (0.50, 0.15),
-    "lips": (0.35, 0.40),
+    "crow": (0.36, 0.95),
+    "nasolabial": (1.70, 0.62),
+    "dimple": (0.50, 0.25),
+    "lips": (0.35, 0.60),
     "chin": (0.50, 0.10),
 }
 
