@@ -122,6 +122,6 @@ def test_wrinkles_rest_at_the_neutral_and_grow_with_the_drive(head, appearance):
 
 def test_too_many_coefficients_and_unknown_people_are_refused(head, assets):
     with pytest.raises(OptionError, match="coefficients"):
-        make_appearance(head, PersonParameters(shape=(0.0,) * 65), 256, assets)
+        make_appearance(head, PersonParameters(shape=(0.0,) * (len(head.shape_names) + 1)), 256, assets)
     with pytest.raises(OptionError, match="nobody"):
         make_appearance(head, PersonParameters(identity="nobody"), 256, assets)

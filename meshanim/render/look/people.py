@@ -1,7 +1,5 @@
 """Twelve people who differ at a glance in shape, age, tone and hair."""
 
-import numpy as np
-
 from meshanim.errors import OptionError
 from meshanim.render.look.person import PersonParameters
 
@@ -11,13 +9,6 @@ __all__ = ["PEOPLE", "find_person"]
 _CALM = {"browInnerUp": 0.16, "eyeWideLeft": 0.06, "eyeWideRight": 0.06}
 _KIND = {**_CALM, "mouthSmileLeft": 0.14, "mouthSmileRight": 0.14}
 _FRESH = {**_KIND, "browInnerUp": 0.22, "browOuterUpLeft": 0.06, "browOuterUpRight": 0.06}
-
-
-def _drawn(seed: int, scale: float = 0.95) -> tuple[float, ...]:
-    """A random identity; the finer directions are damped, so that faces stay in proportion."""
-    draws = np.random.default_rng(seed).normal(size=64) * scale
-    draws[20:] *= 0.8
-    return tuple(float(value) for value in draws.round(3))
 
 
 _TWELVE = (
@@ -151,7 +142,7 @@ _TWELVE = (
     PersonParameters(
         name="Greta",
         seed=77,
-        shape=_drawn(28),
+        identity="greta",
         rest_expression=_KIND,
         tone=0.10,
         undertone=-0.1,
@@ -176,7 +167,7 @@ _TWELVE = (
     PersonParameters(
         name="Henrik",
         seed=88,
-        shape=_drawn(20),
+        identity="henrik",
         rest_expression=_CALM,
         tone=0.20,
         undertone=0.1,
@@ -191,7 +182,7 @@ _TWELVE = (
         hair_color=(0.36, 0.32, 0.29),
         hair_grey=0.8,
         hair_length=0.055,
-        baldness=0.35,
+        baldness=0.3,
         brow_density=1.3,
         brow_thickness=1.3,
         brow_arch=0.8,
@@ -201,7 +192,7 @@ _TWELVE = (
     PersonParameters(
         name="Imani",
         seed=99,
-        shape=_drawn(25),
+        identity="imani",
         rest_expression=_FRESH,
         tone=0.82,
         undertone=0.4,
@@ -222,7 +213,7 @@ _TWELVE = (
     PersonParameters(
         name="Jun",
         seed=110,
-        shape=_drawn(27),
+        identity="jun",
         rest_expression=_CALM,
         tone=0.33,
         undertone=0.8,
@@ -243,7 +234,7 @@ _TWELVE = (
     PersonParameters(
         name="Kavi",
         seed=121,
-        shape=_drawn(12),
+        identity="kavi",
         rest_expression=_KIND,
         tone=0.55,
         undertone=0.5,
@@ -264,7 +255,7 @@ _TWELVE = (
     PersonParameters(
         name="Lena",
         seed=132,
-        shape=_drawn(22),
+        identity="lena",
         rest_expression=_FRESH,
         tone=0.05,
         undertone=0.0,

@@ -101,7 +101,7 @@ def _hanging(points: Points, roots: Points, person: PersonParameters) -> Points:
 
 def _in_fringe(roots: Points, person: PersonParameters) -> np.ndarray:
     """Which strands fall over the forehead: an even draw from the front, fixed by the root's place."""
-    front = (np.abs(roots[:, 0]) < 50) & (roots[:, 2] > -30) & (roots[:, 1] > 80)
+    front = (np.abs(roots[:, 0]) < 44) & (roots[:, 2] > -30) & (roots[:, 1] > 90)
     lot = np.modf(np.abs(np.sin(roots @ np.array([12.9898, 78.233, 37.719])) * 43758.5453))[0]
     return front & (lot < person.fringe)
 
@@ -147,8 +147,8 @@ _STYLES = {
     "crop": _Style(_cropped, _short_sides, 20000, 5, 0.55, 6.0, 0.25, 700, 0.45, 0.9, 0.16),
     "parted": _Style(_parted, _short_sides, 16000, 8, 0.40, 7.0, 0.15, 420, 0.6, 1.0, 0.17),
     "curls": _Style(_outwards, _even, 15000, 16, 0.6, 2.0, 0.05, 1800, 0.45, 2.5, 0.26, 3.8),
-    "bob": _Style(_hanging, _to_one_level, 13000, 12, 0.35, 9.0, 0.2, 330, 0.6, 2.0, 0.20, 0.0, 9.0),
-    "long": _Style(_hanging, _to_one_level, 13000, 14, 0.35, 9.0, 0.25, 260, 0.65, 3.0, 0.20, 0.0, 9.0),
+    "bob": _Style(_hanging, _to_one_level, 14000, 12, 0.35, 9.0, 0.2, 330, 0.6, 2.0, 0.20, 0.0, 12.0),
+    "long": _Style(_hanging, _to_one_level, 14000, 14, 0.35, 9.0, 0.25, 260, 0.65, 3.0, 0.20, 0.0, 12.0),
     "bun": _Style(_tied, _to_knot, 13000, 9, 0.25, 3.0, 0.0, 500, 0.3, 0.6, 0.19, 0.0, 4.0),
 }
 
@@ -176,10 +176,13 @@ def scalp_hair(
     roots = ground.points[texels].astype(float)
     length = style.length(roots, person) * draws.uniform(0.72, 1.06, len(roots))
     edge = hairline(roots, person.baldness, person.masculinity)
-    length = length * (0.45 + 0.55 * smoothstep(-3, 9, edge)) if person.hair != "bun" else length
+    if person.hair != "bun":
+        thin = (0.45 + 0.55 * smoothstep(-3, 9, edge)) * ~_in_fringe(roots, person)
+        length = length * np.where(thin > 0, thin, 1)
     points, normals = _trace(ground, style, roots, ground.atlas.normal[texels], length, person, draws)
     if style.locks:
-        points = _gather(points, style, draws)
+        apart = 1000.0 * _in_fringe(roots, person)  # a fringe and the hair behind it share no locks
+        points = _gather(points, apart, style, draws)
     if style.frizz:
         points = _frizz(points, style, draws)
     if style.curl:
@@ -239,10 +242,11 @@ def _trace(
     return np.stack(points, axis=1), np.stack(normals, axis=1)
 
 
-def _gather(points: np.ndarray, style: _Style, draws: np.random.Generator) -> np.ndarray:
+def _gather(points: np.ndarray, apart: np.ndarray, style: _Style, draws: np.random.Generator) -> np.ndarray:
     """Pull every strand towards the leader of its lock, more so towards the tip."""
     leaders = draws.choice(len(points), min(style.locks, len(points)), replace=False)
-    lock = leaders[cKDTree(points[leaders, 0]).query(points[:, 0])[1]]
+    place = np.concatenate([points[:, 0], apart[:, None]], axis=1)
+    lock = leaders[cKDTree(place[leaders]).query(place)[1]]
     along = np.linspace(0, 1, points.shape[1])[None, :, None]
     own = points - points[:, :1]
     led = points[lock] - points[lock, :1]

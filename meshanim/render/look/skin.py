@@ -255,7 +255,7 @@ def _hair_shadow(canvas: _Canvas, albedo: np.ndarray) -> tuple[np.ndarray, np.nd
     scalp = smoothstep(-6, 10, edge) * canvas.outer * (1 - ears) * has_hair
     if has_hair:
         scalp = scalp * _away_from_ears(canvas)
-    under = 0.86 * scalp[:, None]
+    under = (0.86 if person.hair == "buzz" else 0.95) * scalp[:, None]
     albedo = albedo * (1 - under) + (0.40 * hair + 0.05 * base) * under
 
     brow = _brow_shadow(canvas)[:, None]
