@@ -12,14 +12,14 @@ struct Fragments {
     std::unique_ptr<float[]> floats;
     std::unique_ptr<int[]> ints;
     int *pixel, *face, *part;
-    float *coverage, *depth, *u, *v, *occlusion, *roughness, *specular, *cornea, *lit, *lining;
+    float *coverage, *depth, *u, *v, *occlusion, *roughness, *specular, *cornea, *lit, *lining, *scatter;
     float *position[3], *normal[3], *view[3], *bumped[3], *diffuse[3], *albedo[3], *irradiance[3], *reflection[3], *wrap[3];
 
     explicit Fragments(int capacity) {
-        float **single[] = {&coverage, &depth, &u, &v, &occlusion, &roughness, &specular, &cornea, &lit, &lining};
+        float **single[] = {&coverage, &depth, &u, &v, &occlusion, &roughness, &specular, &cornea, &lit, &lining, &scatter};
         float **triple[] = {position, normal, view, bumped, diffuse, albedo, irradiance, reflection, wrap};
         const int64_t padded = (capacity + 15) / 16 * 16;
-        floats.reset(new float[padded * (10 + 3 * 9)]);
+        floats.reset(new float[padded * (11 + 3 * 9)]);
         ints.reset(new int[padded * 3]);
         float *next = floats.get();
         for (float **field : single) *field = next, next += padded;

@@ -194,7 +194,7 @@ void skin_material(const Mesh &mesh, const Part &part, Fragments &r, int i) {
     r.albedo[1][i] = texel[1] * (1 - 0.36f * cavity);
     r.albedo[2][i] = texel[2] * (1 - 0.38f * cavity);
     r.roughness[i] = texel[3], r.specular[i] = texel[4] * part.specular;
-    r.lining[i] = texel[5];
+    r.lining[i] = texel[5], r.scatter[i] = texel[7];
     // Surface gradient of the height by u and v (Mikkelsen 2010, eq. 4, with dP/du and dP/dv of the face).
     const int64_t f = r.face[i];
     const int32_t *corner = mesh.faces + 3 * f;
@@ -253,7 +253,7 @@ void eye_material(const Part &part, Fragments &r, int i) {
 }
 
 void material(const Mesh &mesh, const Part &part, const Quality &quality, Fragments &r, int i) {
-    r.lining[i] = 0;
+    r.lining[i] = 0, r.scatter[i] = part.scatter ? 1.0f : 0.0f;
     if (part.kind == SKIN) skin_material(mesh, part, r, i);
     if (part.kind == EYE) eye_material(part, r, i);
     if (part.kind == TEXTURED) {
@@ -406,17 +406,15 @@ void shade(const Mesh &mesh, const Part *parts, const View &view, const Lighting
                 const int64_t at = row + r.pixel[i];
                 const float c = r.coverage[i];
                 planes[OPACITY * area + at] += c;
+                // What is scattered is blurred later; the rest of the light is final here.
                 const bool scatter = quality.scatter && parts[r.part[i]].scatter;
+                const float blurred = scatter ? clamp(r.scatter[i], 0.0f, 1.0f) : 0.0f;
                 if (scatter) planes[SCATTER * area + at] += c, near[at] = std::min(near[at], r.depth[i]);
                 for (int k = 0; k < 3; ++k) {
-                    const float shine = std::min(r.reflection[k][i], 8.0f);
-                    if (scatter) {
-                        planes[(ALBEDO + k) * area + at] += c * r.albedo[k][i];
-                        planes[(IRRADIANCE + k) * area + at] += c * r.irradiance[k][i];
-                        planes[(LIGHT + k) * area + at] += c * shine;
-                    } else {
-                        planes[(LIGHT + k) * area + at] += c * (r.albedo[k][i] * r.irradiance[k][i] + shine);
-                    }
+                    const float shine = std::min(r.reflection[k][i], 8.0f), light = r.irradiance[k][i];
+                    planes[(ALBEDO + k) * area + at] += c * r.albedo[k][i] * blurred;
+                    if (scatter) planes[(IRRADIANCE + k) * area + at] += c * light;
+                    planes[(LIGHT + k) * area + at] += c * (r.albedo[k][i] * light * (1 - blurred) + shine);
                 }
             }
         }
