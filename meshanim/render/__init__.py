@@ -4,6 +4,7 @@ from meshanim.render.camera import Camera, look_at, orthographic_camera, portrai
 from meshanim.render.clay import render_mesh
 from meshanim.render.lighting import DRAFT, FULL, STUDIO, Light, Lighting, Quality
 from meshanim.render.rasterizer import RasterBuffers, rasterize
+from meshanim.render.renderer import Renderer, RenderMaps, head_camera
 
 __all__ = [
     "DRAFT",
@@ -14,6 +15,9 @@ __all__ = [
     "Lighting",
     "Quality",
     "RasterBuffers",
+    "RenderMaps",
+    "Renderer",
+    "head_camera",
     "look_at",
     "orthographic_camera",
     "portrait_camera",

@@ -10,11 +10,11 @@ from meshanim.heads import DefaultHead
 from meshanim.render.camera import Camera, portrait_camera
 from meshanim.render.frame import Canvas, paint, require_native
 from meshanim.render.lighting import STUDIO, Lighting, Quality, backdrop, quality_named
-from meshanim.render.look import Appearance
+from meshanim.render.look import Appearance, strand_points
 from meshanim.render.rasterizer import rasterize
 from meshanim.render.scene import PART_NAMES, HeadScene
 
-__all__ = ["RenderMaps", "Renderer"]
+__all__ = ["RenderMaps", "Renderer", "head_camera"]
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Renderer:
             raise OptionError(f"threads must be at least 1, not {threads}")
         self.head = head
         self.quality = quality_named(quality)
-        self.camera = camera or portrait_camera(appearance.template, width, height)
+        self.camera = camera or head_camera(appearance, width, height)
         if self.camera.orthographic:
             raise OptionError("Renderer needs a perspective camera")
         size = (self.camera.height, self.camera.width, 3)
@@ -181,6 +181,31 @@ class Renderer:
         if expression is not None and expression.shape != (len(names),):
             raise ShapeError(f"expression must be ({len(names)},), not {expression.shape}")
         self._stage.pose(vertices, expression, self.threads)
+
+
+def head_camera(
+    appearance: Appearance,
+    width: int = 512,
+    height: int = 512,
+    azimuth: float = 0.0,
+    elevation: float = 0.0,
+) -> Camera:
+    """A camera that frames a person's head, hair included, and cuts the neck where it fades.
+
+    Parameters
+    ----------
+    appearance : Appearance
+    width, height : int
+        Pixels.
+    azimuth, elevation : float
+        Radians; positive azimuth moves the camera towards +x, positive elevation up.
+    """
+    skin = appearance.surface.vertices(appearance.template)
+    points = [skin[skin[:, 1] > appearance.neck_fade[:, 1].max() + 0.02]]
+    for strands in appearance.strands:
+        if strands.kind in ("hair", "beard") and len(strands):
+            points.append(strand_points(strands, skin, appearance.surface.faces)[:, -1])
+    return portrait_camera(np.concatenate(points), width, height, azimuth, elevation, margin=0.03)
 
 
 def _face_regions(head: DefaultHead, scene: HeadScene) -> tuple[np.ndarray, tuple[str, ...]]:

@@ -18,7 +18,8 @@ struct Fragments {
     explicit Fragments(int capacity) {
         float **single[] = {&coverage, &depth, &u, &v, &occlusion, &roughness, &specular, &cornea, &lit, &lining, &scatter};
         float **triple[] = {position, normal, view, bumped, diffuse, albedo, irradiance, reflection, wrap};
-        const int64_t padded = (capacity + 15) / 16 * 16;
+        // Not a multiple of a page, or all fields of a fragment would fall into the same cache set.
+        const int64_t padded = (capacity + 1023) / 1024 * 1024 + 48;
         floats.reset(new float[padded * (11 + 3 * 9)]);
         ints.reset(new int[padded * 3]);
         float *next = floats.get();

@@ -87,6 +87,37 @@ struct Eye {
     }
 };
 
+struct Taps {                                // a disc of samples on Vogel's spiral, turned a fragment
+    float x[64], y[64];
+    int n;
+    Taps(int count, bool even_area) : n(std::min(count, 64)) {
+        for (int k = 0; k < n; ++k) {
+            const float t = (k + 0.5f) / n, radius = even_area ? std::sqrt(t) : t, angle = k * 2.399963f;
+            x[k] = radius * std::cos(angle), y[k] = radius * std::sin(angle);
+        }
+    }
+};
+
+struct Turn {
+    float cosine, sine;
+    explicit Turn(float angle) : cosine(std::cos(angle)), sine(std::sin(angle)) {}
+};
+
+struct Lamp {                                // the shadow map's camera: pixels and depth of a point
+    Vec x, y, z;
+    float at[3], scale;
+    int width, height;
+    const float *map;
+
+    Lamp(const View &v, const float *map) : width(v.width), height(v.height), map(map) {
+        const double *m = v.world_to_camera;
+        scale = float(v.fx);
+        x = Vec{float(m[0]), float(m[1]), float(m[2])} * scale, at[0] = float(m[3] * v.fx + v.cx);
+        y = Vec{float(m[4]), float(m[5]), float(m[6])} * float(v.fy), at[1] = float(m[7] * v.fy + v.cy);
+        z = {float(m[8]), float(m[9]), float(m[10])}, at[2] = float(m[11]);
+    }
+};
+
 struct Surface {                             // where a ray meets a face
     Vec position, normal;
     float weight[3];
@@ -272,43 +303,49 @@ void material(const Mesh &mesh, const Part &part, const Quality &quality, Fragme
 }
 
 // Screen-space occlusion within 6 mm, for contact that the resting sky visibility does not know.
-float screen_occlusion(const Eye &eye, const Quality &q, int width, int height, const float *depth, const Fragments &r,
-                       int i, int y) {
-    const int s = q.samples;
-    const float reach = std::max(0.004f * q.pixels_per_metre, 1.0f), turn = noise(r.pixel[i], y) * 2 * PI;
+float screen_occlusion(const Eye &eye, const Quality &q, const Taps &taps, Turn turn, int width, int height,
+                       const float *depth, const Fragments &r, int i, int y) {
+    const int s = q.samples, columns = width * s, rows = height * s;
+    const float reach = std::max(0.004f * q.pixels_per_metre, 1.0f) * s, least = 0.75f * s;
+    const float px = (r.pixel[i] + 0.5f) * s, py = (y + 0.5f) * s, back = 1.0f / s;
     const Vec p = r.get(r.position, i), n = r.get(r.normal, i);
     float occlusion = 0, weight = 0;
-    for (int k = 0; k < q.occlusion_taps; ++k) {
-        const float radius = reach * (k + 0.5f) / q.occlusion_taps + 0.75f, angle = k * 2.399963f + turn;
-        const int x = int(std::floor((r.pixel[i] + 0.5f + radius * std::cos(angle)) * s));
-        const int v = int(std::floor((y + 0.5f + radius * std::sin(angle)) * s));
-        if (x < 0 || v < 0 || x >= width * s || v >= height * s) continue;
+    for (int k = 0; k < taps.n; ++k) {
+        const float ux = taps.x[k] * turn.cosine - taps.y[k] * turn.sine, uy = taps.x[k] * turn.sine + taps.y[k] * turn.cosine;
+        const float stretch = reach + least / ((k + 0.5f) / taps.n);
+        const int x = int(px + stretch * ux), v = int(py + stretch * uy);
+        if (x < 0 || v < 0 || x >= columns || v >= rows) continue;
         ++weight;
-        const float z = depth[int64_t(v) * width * s + x];
+        const float z = depth[int64_t(v) * columns + x];
         if (!(z < 1e30f)) continue;
-        const Vec d = eye.position + eye.ray((x + 0.5f) / s, (v + 0.5f) / s) * z - p;
-        const float l = length(d) + 1e-9f, c = dot(d, n) / l;
-        if (c > 0.12f) occlusion += (c - 0.12f) * std::max(0.0f, 1 - (l / 0.006f) * (l / 0.006f));
+        const Vec d = eye.position + eye.ray((x + 0.5f) * back, (v + 0.5f) * back) * z - p;
+        const float square = dot(d, d) + 1e-18f, fall = 1 - square * (1 / (0.006f * 0.006f));
+        if (fall <= 0) continue;
+        const float c = dot(d, n) / std::sqrt(square);
+        if (c > 0.12f) occlusion += (c - 0.12f) * fall;
     }
     return std::max(0.0f, 1 - 2.1f * occlusion / std::max(weight, 1.0f));
 }
 
 // Share of a disc in the shadow map that is not nearer to the light.
-float shadow(const View &light, const float *map, const Quality &q, Vec p, Vec n, float turn) {
+float shadow(const Lamp &lamp, const Quality &q, const Taps &taps, Turn turn, Vec p, Vec n) {
     constexpr float BIAS = 0.0012f;
     const Vec a = p + n * BIAS;
-    const double *m = light.world_to_camera;
-    const float x = float((m[0] * a.x + m[1] * a.y + m[2] * a.z + m[3]) * light.fx + light.cx);
-    const float y = float((m[4] * a.x + m[5] * a.y + m[6] * a.z + m[7]) * light.fy + light.cy);
-    const float z = float(m[8] * a.x + m[9] * a.y + m[10] * a.z + m[11]) - BIAS;
-    const float reach = q.shadow_radius * float(light.fx);
-    float sum = 0;
-    for (int k = 0; k < q.shadow_taps; ++k) {
-        const float radius = reach * std::sqrt((k + 0.5f) / q.shadow_taps), angle = k * 2.399963f + turn;
-        const int i = int(std::floor(x + radius * std::cos(angle))), j = int(std::floor(y + radius * std::sin(angle)));
-        if (i < 0 || j < 0 || i >= light.width || j >= light.height || map[int64_t(j) * light.width + i] > z) ++sum;
+    const float x = dot(lamp.x, a) + lamp.at[0], y = dot(lamp.y, a) + lamp.at[1], z = dot(lamp.z, a) + lamp.at[2] - BIAS;
+    const float c = q.shadow_radius * lamp.scale * turn.cosine, s = q.shadow_radius * lamp.scale * turn.sine;
+    int lit = 0;
+    for (int k = 0; k < taps.n; ++k) {
+        const int i = int(std::floor(x + taps.x[k] * c - taps.y[k] * s)), j = int(std::floor(y + taps.x[k] * s + taps.y[k] * c));
+        lit += i < 0 || j < 0 || i >= lamp.width || j >= lamp.height || lamp.map[int64_t(j) * lamp.width + i] > z;
     }
-    return sum / q.shadow_taps;
+    return float(lit) / taps.n;
+}
+
+// GGX distribution over Smith's geometry term (Karis 2013, k = (roughness + 1)^2 / 8).
+inline float lobe(float roughness, float nh, float nl, float nv) {
+    const float square = roughness * roughness, a2 = square * square, t = nh * nh * (a2 - 1) + 1;
+    const float k = (roughness + 1) * (roughness + 1) * 0.125f;
+    return a2 / (PI * t * t * (nl * (1 - k) + k) * (nv * (1 - k) + k));
 }
 
 // Wrapped diffuse and two GGX lobes of every light, over all fragments of the row.
@@ -322,38 +359,38 @@ void lights(const Lighting &lighting, const Part *parts, const Quality &q, Fragm
         r.irradiance[2][i] = (lighting.ground[2] + (lighting.sky[2] - lighting.ground[2]) * up) * ao;
         r.reflection[0][i] = r.reflection[1][i] = r.reflection[2][i] = 0;
     }
+    const float first_share = q.lobes > 1 ? 0.7f : 1.0f, second_share = 1 - first_share;
     for (int j = 0; j < lighting.n; ++j) {
-        const float *l = lighting.direction[j], *c = lighting.color[j];
-        const bool shadowed = j == lighting.shadowed;
-        const bool two = q.lobes > 1;
+        const float lx = lighting.direction[j][0], ly = lighting.direction[j][1], lz = lighting.direction[j][2];
+        const float red = lighting.color[j][0], green = lighting.color[j][1], blue = lighting.color[j][2];
+        const float shadowed = j == lighting.shadowed ? 1.0f : 0.0f;
+        const float *occlusion = r.occlusion, *in_light = r.lit, *roughness = r.roughness, *specular = r.specular;
+        const float *dx = r.diffuse[0], *dy = r.diffuse[1], *dz = r.diffuse[2];
+        const float *bx = r.bumped[0], *by = r.bumped[1], *bz = r.bumped[2];
+        const float *ex = r.view[0], *ey = r.view[1], *ez = r.view[2];
+        const float *w0 = r.wrap[0], *w1 = r.wrap[1], *w2 = r.wrap[2];
+        float *e0 = r.irradiance[0], *e1 = r.irradiance[1], *e2 = r.irradiance[2];
+        float *s0 = r.reflection[0], *s1 = r.reflection[1], *s2 = r.reflection[2];
 #pragma omp simd
         for (int i = 0; i < n; ++i) {
-            const float ao = r.occlusion[i], lit = shadowed ? r.lit[i] : 1.0f;
-            const float nd = r.diffuse[0][i] * l[0] + r.diffuse[1][i] * l[1] + r.diffuse[2][i] * l[2];
+            const float ao = occlusion[i], lit = 1 + shadowed * (in_light[i] - 1);
+            const float nd = dx[i] * lx + dy[i] * ly + dz[i] * lz;
             const float amount = lit * std::min(1.0f, 0.4f + 0.6f * ao) * (1.35f / PI);
-            for (int k = 0; k < 3; ++k) {
-                const float w = r.wrap[k][i], d = (nd + w) / (1 + w);
-                r.irradiance[k][i] += c[k] * amount * std::max(d, 0.0f);
-            }
-            const float nx = r.bumped[0][i], ny = r.bumped[1][i], nz = r.bumped[2][i];
-            const float vx = r.view[0][i], vy = r.view[1][i], vz = r.view[2][i];
-            const float nl = nx * l[0] + ny * l[1] + nz * l[2];
+            e0[i] += red * amount * std::max((nd + w0[i]) / (1 + w0[i]), 0.0f);
+            e1[i] += green * amount * std::max((nd + w1[i]) / (1 + w1[i]), 0.0f);
+            e2[i] += blue * amount * std::max((nd + w2[i]) / (1 + w2[i]), 0.0f);
+            const float nx = bx[i], ny = by[i], nz = bz[i], vx = ex[i], vy = ey[i], vz = ez[i];
+            const float nl = std::max(0.0f, nx * lx + ny * ly + nz * lz);
             const float nv = std::max(0.05f, nx * vx + ny * vy + nz * vz);
-            const float hx = l[0] + vx, hy = l[1] + vy, hz = l[2] + vz;
+            const float hx = lx + vx, hy = ly + vy, hz = lz + vz;
             const float inverse = 1 / std::sqrt(hx * hx + hy * hy + hz * hz + 1e-12f);
             const float nh = std::min(1.0f, std::max(0.0f, (nx * hx + ny * hy + nz * hz) * inverse));
-            const float vh = std::max(0.0f, (vx * hx + vy * hy + vz * hz) * inverse);
-            const float g = 1 - vh, fresnel = SPECULAR_NORMAL + (1 - SPECULAR_NORMAL) * g * g * g * g * g;
-            float sum = 0;
-            for (int lobe = 0; lobe < 2; ++lobe) {
-                const float rough = lobe == 0 ? r.roughness[i] : std::max(0.08f, r.roughness[i] * 0.62f);
-                const float a2 = rough * rough * rough * rough, t = nh * nh * (a2 - 1) + 1;
-                const float k = (rough + 1) * (rough + 1) * 0.125f;
-                const float d = a2 / (PI * t * t * (nl * (1 - k) + k) * (nv * (1 - k) + k));
-                sum += (two ? (lobe == 0 ? 0.7f : 0.3f) : (lobe == 0 ? 1.0f : 0.0f)) * d;
-            }
-            const float shine = nl > 0 ? r.specular[i] * lit * ao * sum * 0.25f * fresnel * nl : 0.0f;
-            for (int k = 0; k < 3; ++k) r.reflection[k][i] += shine * c[k];
+            const float g = 1 - std::max(0.0f, (vx * hx + vy * hy + vz * hz) * inverse), g2 = g * g;
+            const float fresnel = SPECULAR_NORMAL + (1 - SPECULAR_NORMAL) * g2 * g2 * g;
+            const float lobes = first_share * lobe(roughness[i], nh, nl, nv) +
+                                second_share * lobe(std::max(0.08f, roughness[i] * 0.62f), nh, nl, nv);
+            const float shine = specular[i] * lit * ao * lobes * 0.25f * fresnel * nl;
+            s0[i] += shine * red, s1[i] += shine * green, s2[i] += shine * blue;
         }
     }
     // Reflection of the sky: a horizon gradient; eyes see one soft box instead.
@@ -383,6 +420,8 @@ void shade(const Mesh &mesh, const Part *parts, const View &view, const Lighting
     const int width = view.width, height = view.height;
     const int64_t area = int64_t(width) * height;
     const Eye eye(view);
+    const Lamp lamp(light, map);
+    const Taps shadow_taps(quality.shadow_taps, true), occlusion_taps(quality.occlusion_taps, false);
 #pragma omp parallel num_threads(threads)
     {
         Fragments r(width * quality.samples * quality.samples);
@@ -397,9 +436,10 @@ void shade(const Mesh &mesh, const Part *parts, const View &view, const Lighting
                 material(mesh, part, quality, r, i);
                 const float wrap[3] = {part.kind == SKIN ? 0.20f : 0.05f, part.kind == SKIN ? 0.08f : 0.05f, 0.05f};
                 for (int k = 0; k < 3; ++k) r.wrap[k][i] = wrap[k];
+                const Turn turn(noise(r.pixel[i], y) * 2 * PI);
                 if (quality.occlusion_taps > 0 && part.kind != EYE)
-                    r.occlusion[i] *= 0.5f + 0.5f * screen_occlusion(eye, quality, width, height, depth, r, i, y);
-                if (map) r.lit[i] = shadow(light, map, quality, r.get(r.position, i), r.get(r.normal, i), noise(r.pixel[i], y) * 2 * PI);
+                    r.occlusion[i] *= 0.5f + 0.5f * screen_occlusion(eye, quality, occlusion_taps, turn, width, height, depth, r, i, y);
+                if (map) r.lit[i] = shadow(lamp, quality, shadow_taps, turn, r.get(r.position, i), r.get(r.normal, i));
             }
             lights(lighting, parts, quality, r, n);
             for (int i = 0; i < n; ++i) {
