@@ -5,6 +5,7 @@ from meshanim.render.clay import render_mesh
 from meshanim.render.lighting import DRAFT, FULL, STUDIO, Light, Lighting, Quality
 from meshanim.render.rasterizer import RasterBuffers, rasterize
 from meshanim.render.renderer import Renderer, RenderMaps, head_camera
+from meshanim.render.sequence import render_sequence
 
 __all__ = [
     "DRAFT",
@@ -23,4 +24,5 @@ __all__ = [
     "portrait_camera",
     "rasterize",
     "render_mesh",
+    "render_sequence",
 ]

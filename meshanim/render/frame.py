@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Integer
 
 from meshanim.errors import BackendError
 from meshanim.render.camera import Camera, orthographic_camera
@@ -48,7 +48,7 @@ class Geometry:
         self,
         faces: Int[np.ndarray, "faces 3"],
         n_vertices: int,
-        part: Int[np.ndarray, " faces"] | None = None,
+        part: Integer[np.ndarray, " faces"] | None = None,
         corner_uv: Float[np.ndarray, "faces 3 2"] | None = None,
         sky: Float[np.ndarray, " vertices"] | None = None,
         fade: Float[np.ndarray, " vertices"] | None = None,

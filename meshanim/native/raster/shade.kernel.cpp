@@ -284,7 +284,7 @@ void eye_material(const Part &part, Fragments &r, int i) {
 }
 
 void material(const Mesh &mesh, const Part &part, const Quality &quality, Fragments &r, int i) {
-    r.lining[i] = 0, r.scatter[i] = part.scatter ? 1.0f : 0.0f;
+    r.lining[i] = 0, r.open[i] = 1, r.scatter[i] = part.scatter ? 1.0f : 0.0f;
     if (part.kind == SKIN) skin_material(mesh, part, r, i);
     if (part.kind == EYE) eye_material(part, r, i);
     if (part.kind == TEXTURED) {
@@ -298,7 +298,9 @@ void material(const Mesh &mesh, const Part &part, const Quality &quality, Fragme
         const float behind = r.position[0][i] * p[0] + r.position[1][i] * p[1] + r.position[2][i] * p[2] + p[3];
         float light = clamp(part.mouth_start - behind / part.mouth_length, part.mouth_floor, 1.0f);
         if (part.mouth_power != 1) light = std::pow(light, part.mouth_power);
-        r.occlusion[i] *= part.kind == SKIN ? 1 - r.lining[i] * (1 - light) : light;
+        if (part.kind == SKIN) light = 1 - r.lining[i] * (1 - light);
+        r.occlusion[i] *= light;
+        r.open[i] = light * light;           // lights without a shadow map do not shine into the mouth
     }
 }
 
@@ -364,7 +366,7 @@ void lights(const Lighting &lighting, const Part *parts, const Quality &q, Fragm
         const float lx = lighting.direction[j][0], ly = lighting.direction[j][1], lz = lighting.direction[j][2];
         const float red = lighting.color[j][0], green = lighting.color[j][1], blue = lighting.color[j][2];
         const float shadowed = j == lighting.shadowed ? 1.0f : 0.0f;
-        const float *occlusion = r.occlusion, *in_light = r.lit, *roughness = r.roughness, *specular = r.specular;
+        const float *occlusion = r.occlusion, *in_light = r.lit, *open = r.open, *roughness = r.roughness, *specular = r.specular;
         const float *dx = r.diffuse[0], *dy = r.diffuse[1], *dz = r.diffuse[2];
         const float *bx = r.bumped[0], *by = r.bumped[1], *bz = r.bumped[2];
         const float *ex = r.view[0], *ey = r.view[1], *ez = r.view[2];
@@ -373,7 +375,7 @@ void lights(const Lighting &lighting, const Part *parts, const Quality &q, Fragm
         float *s0 = r.reflection[0], *s1 = r.reflection[1], *s2 = r.reflection[2];
 #pragma omp simd
         for (int i = 0; i < n; ++i) {
-            const float ao = occlusion[i], lit = 1 + shadowed * (in_light[i] - 1);
+            const float ao = occlusion[i], lit = open[i] + shadowed * (in_light[i] - open[i]);
             const float nd = dx[i] * lx + dy[i] * ly + dz[i] * lz;
             const float amount = lit * std::min(1.0f, 0.4f + 0.6f * ao) * (1.35f / PI);
             e0[i] += red * amount * std::max((nd + w0[i]) / (1 + w0[i]), 0.0f);

@@ -31,6 +31,35 @@ struct Offset {
     int64_t value;
 };
 
+// Strands of one band of rows. Where a nearer surface hides some of a pixel's samples, strands gather in `behind`, so
+// that many of them do not wear away the surface's edge; `share` is the part of the pixel that they can be seen in.
+struct Layer {
+    float light[3], opacity;
+};
+
+struct Pixel {
+    Layer front, behind;
+    float share;
+};
+
+inline void over(Layer &layer, const float *color, float cover) {
+    for (int k = 0; k < 3; ++k) layer.light[k] += cover * (color[k] - layer.light[k]);
+    layer.opacity += cover * (1 - layer.opacity);
+}
+
+inline void merge(const Pixel &strands, float *planes, int64_t area, int64_t pixel) {
+    float &opacity = planes[OPACITY * area + pixel];
+    const float empty = 1 - std::min(opacity, 1.0f), hidden = std::max(0.0f, strands.share - empty);
+    const float keep = 1 - std::min(1.0f, hidden / std::max(opacity, 1e-3f)) * strands.behind.opacity;
+    const float through = 1 - strands.front.opacity;
+    for (int k = 0; k < 3; ++k) {
+        float &light = planes[(LIGHT + k) * area + pixel];
+        light = (light * keep + strands.share * strands.behind.light[k]) * through + strands.front.light[k];
+    }
+    const float below = std::min(1.0f, opacity * keep + strands.share * strands.behind.opacity);
+    opacity = below * through + strands.front.opacity;
+}
+
 inline float power40(float x) {
     const float x2 = x * x, x4 = x2 * x2, x8 = x4 * x4, x16 = x8 * x8;
     return x16 * x16 * x8;
@@ -134,6 +163,8 @@ void draw_strands(const Mesh &mesh, const Strands &strands, const View &view, co
 #pragma omp parallel for num_threads(threads) schedule(dynamic)
     for (int band = 0; band < bands; ++band) {
         const int row0 = band * BAND, row1 = std::min(height, row0 + BAND);
+        if (start[band].value == start[band + 1].value) continue;
+        std::vector<Pixel> layers(int64_t(row1 - row0) * width, Pixel{});
         for (int64_t at = start[band].value; at < start[band + 1].value; ++at) {
             const int64_t strand = binned[at].value;
             const Point *p = points.data() + strand * count;
@@ -164,20 +195,17 @@ void draw_strands(const Mesh &mesh, const Strands &strands, const View &view, co
                             for (int i = 0; i < samples; ++i)
                                 seen += z <= depth[(int64_t(y) * samples + j) * width * samples + x * samples + i];
                         if (!seen) continue;
-                        cover *= seen * share;
                         const Vec color = a.color * (1 - t) + b.color * t;
-                        const int64_t pixel = int64_t(y) * width + x;
                         const float value[3] = {color.x, color.y, color.z};
-                        for (int k = 0; k < 3; ++k) {
-                            float &target = planes[(LIGHT + k) * area + pixel];
-                            target += cover * (value[k] - target);
-                        }
-                        float &alpha = planes[OPACITY * area + pixel];
-                        alpha += cover * (1 - alpha);
+                        Pixel &pixel = layers[int64_t(y - row0) * width + x];
+                        over(seen == samples * samples ? pixel.front : pixel.behind, value, cover);
+                        if (seen < samples * samples) pixel.share = std::max(pixel.share, seen * share);
                     }
                 }
             }
         }
+        for (int64_t i = 0; i < int64_t(layers.size()); ++i)
+            if (layers[i].front.opacity + layers[i].behind.opacity > 0) merge(layers[i], planes, area, int64_t(row0) * width + i);
     }
 }
 
