@@ -218,6 +218,11 @@ class VisemeEncoder(SpeechEncoder):
     prior : float
         Seconds that the prior of running normalisation is worth, 0.01 to 3.
 
+    Attributes
+    ----------
+    bilabial : int or None
+        Which feature is the probability of p, b or m; None where features are no probabilities.
+
     Raises
     ------
     OptionError
@@ -244,6 +249,7 @@ class VisemeEncoder(SpeechEncoder):
         self.name = "visemes"
         self.rate = DEFAULT_MEL.fps / 2
         self.dim = self.net.config.width if outputs == "hidden" else len(PHONEMES) + len(VISEMES)
+        self.bilabial = len(PHONEMES) + VISEMES.index("bmp") if outputs == "posteriors" else None
 
     @torch.inference_mode()
     def __call__(self, waveform: Waveform) -> Float32[Tensor, "frames dim"]:

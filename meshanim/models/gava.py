@@ -214,7 +214,9 @@ class Gava(nn.Module, PyTorchModelHubMixin):
         style = self.subject_styles(torch.where(subjects < 0, len(self.config.subjects), subjects))
         if emotions is not None:
             emotion = self.emotion_styles(emotions)
-            style = style + (emotion if intensities is None else emotion * intensities[:, None])
+            # Emotion 0 is neutral: it has no vector of its own.
+            strength = (emotions > 0).to(emotion) if intensities is None else intensities * (emotions > 0)
+            style = style + emotion * strength[:, None]
         return style
 
     def style_of(

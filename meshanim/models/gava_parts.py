@@ -20,14 +20,29 @@ __all__ = [
 
 
 class _SparseProduct(torch.autograd.Function):
+    """Rows of a sparse matrix times a dense one, with the transpose at hand for the gradient."""
+
     @staticmethod
-    def forward(context, matrix: Tensor, transpose: Tensor, dense: Tensor) -> Tensor:
-        context.transpose = transpose
-        return matrix @ dense
+    def forward(context, dense: Tensor, *parts: Tensor) -> Tensor:
+        context.save_for_backward(*parts)
+        offsets, columns, values = parts[:3]
+        return functional.embedding_bag(
+            columns, dense, offsets, mode="sum", per_sample_weights=values, include_last_offset=True
+        )
 
     @staticmethod
     def backward(context, gradient: Tensor):
-        return None, None, context.transpose @ gradient.contiguous()
+        parts = context.saved_tensors
+        offsets, columns, values = parts[3:]
+        back = functional.embedding_bag(
+            columns,
+            gradient.contiguous(),
+            offsets,
+            mode="sum",
+            per_sample_weights=values,
+            include_last_offset=True,
+        )
+        return back, None, None, None, None, None, None
 
 
 class SparseRows(nn.Module):
@@ -55,31 +70,33 @@ class SparseRows(nn.Module):
         self.register_buffer("rows", rows.to(torch.int32))
         self.register_buffer("columns", columns.to(torch.int32))
         self.register_buffer("values", values.to(torch.float32))
-        self._matrices: tuple[Tensor, Tensor] | None = None
-
-    def matrices(self, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-        """The matrix and its transpose in CSR, on the device of the buffers."""
-        if (
-            self._matrices is None
-            or self._matrices[0].device != self.values.device
-            or self._matrices[0].dtype != dtype
-        ):
-            with torch.inference_mode(False):
-                indices = torch.stack([self.rows, self.columns]).long()
-                values = self.values.to(dtype)
-                matrix = torch.sparse_coo_tensor(indices, values, self.shape).coalesce()
-                transpose = torch.sparse_coo_tensor(indices.flip(0), values, self.shape[::-1]).coalesce()
-                self._matrices = (matrix.to_sparse_csr(), transpose.to_sparse_csr())
-        return self._matrices
+        matrix = (*_grouped(rows, columns, shape[0]), values), (*_grouped(columns, rows, shape[1]), values)
+        for name, (order, offsets, others, weights) in zip(("forward", "backward"), matrix):
+            self.register_buffer(f"{name}_offsets", offsets, persistent=False)
+            self.register_buffer(f"{name}_columns", others, persistent=False)
+            self.register_buffer(f"{name}_values", weights[order].to(torch.float32), persistent=False)
 
     def forward(self, attributes: Float[Tensor, "batch columns width"]) -> Float[Tensor, "batch rows width"]:
         """Carry attributes over: one sparse product for the whole batch."""
         batch, columns, width = attributes.shape
         flat = attributes.transpose(0, 1).reshape(columns, batch * width)
-        with torch.autocast(attributes.device.type, enabled=False):
-            flat = flat.float() if flat.dtype in (torch.float16, torch.bfloat16) else flat
-            carried = _SparseProduct.apply(*self.matrices(flat.dtype), flat)
+        flat = flat.float() if flat.dtype in (torch.float16, torch.bfloat16) else flat
+        parts = [
+            getattr(self, f"{direction}_{part}")
+            for direction in ("forward", "backward")
+            for part in ("offsets", "columns", "values")
+        ]
+        parts = [part.to(flat) if part.is_floating_point() else part for part in parts]
+        carried = _SparseProduct.apply(flat, *parts)
         return carried.reshape(-1, batch, width).transpose(0, 1)
+
+
+def _grouped(rows: Tensor, columns: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:
+    """The order that sorts entries by row, where each row starts and the last ends, and the columns."""
+    order = torch.argsort(rows, stable=True)
+    sizes = torch.bincount(rows.long(), minlength=count)
+    offsets = torch.cat([sizes.new_zeros(1), sizes.cumsum(0)])
+    return order, offsets, columns[order].long()
 
 
 class WindowEncoder(nn.Module):

@@ -10,6 +10,7 @@ from meshanim.attention import MeshGraph
 from meshanim.errors import FileFormatError
 from meshanim.geometry import TriangleMesh
 from meshanim.models.gava_parts import SparseRows
+from meshanim.models.token_mesh import choose_tokens
 
 __all__ = ["VertexTokens", "vertex_descriptors"]
 
@@ -47,7 +48,7 @@ def vertex_descriptors(mesh: TriangleMesh, eigenfunctions: int) -> Float[np.ndar
 
 
 class VertexTokens(nn.Module):
-    """Tokens on a mesh: all of its vertices, or a decimated mesh with a fixed prolongation to the full one.
+    """Tokens on a mesh: all of its vertices, or some with a fixed geometric prolongation to the others.
 
     Everything is a buffer, so that a checkpoint carries its mesh.
 
@@ -58,13 +59,15 @@ class VertexTokens(nn.Module):
     faces : (F, 3) int
         Its triangles.
     edges : (E, 2) int
-        Edges of the token mesh.
+        Pairs of neighbouring tokens.
     descriptors : (N, C) float
         As `vertex_descriptors` makes them, for each token.
     amplitude : (N,) float
         Metres that one unit of network output moves each token.
-    prolongation, restriction : SparseRows, optional
-        (V, N), tokens to vertices, and (N, V), vertices to tokens; not given where tokens are the vertices.
+    vertices : (N,) int
+        The vertex that each token is.
+    prolongation : SparseRows, optional
+        (V, N), tokens to vertices; not given where every vertex is a token.
     """
 
     def __init__(
@@ -74,8 +77,8 @@ class VertexTokens(nn.Module):
         edges: Int[Tensor, "edges 2"],
         descriptors: Float[Tensor, "tokens descriptors"],
         amplitude: Float[Tensor, " tokens"],
+        vertices: Int[Tensor, " tokens"],
         prolongation: SparseRows | None = None,
-        restriction: SparseRows | None = None,
     ):
         super().__init__()
         self.register_buffer("template", template)
@@ -83,13 +86,17 @@ class VertexTokens(nn.Module):
         self.register_buffer("edges", edges.to(torch.int32))
         self.register_buffer("descriptors", descriptors)
         self.register_buffer("amplitude", amplitude)
+        self.register_buffer("vertices", vertices.to(torch.int64))
         self.prolongation = prolongation
-        self.restriction = restriction
         self._graphs: dict[tuple, MeshGraph] = {}
 
     @classmethod
     def from_mesh(
-        cls, mesh: TriangleMesh, tokens: int | str = "vertices", eigenfunctions: int = 64
+        cls,
+        mesh: TriangleMesh,
+        tokens: int | str = "vertices",
+        eigenfunctions: int = 64,
+        motion: Float[np.ndarray, "examples vertices 3"] | None = None,
     ) -> "VertexTokens":
         """Tokens of a mesh.
 
@@ -98,24 +105,26 @@ class VertexTokens(nn.Module):
         mesh : TriangleMesh
             Any topology; disconnected parts are kept.
         tokens : "vertices" or int
-            One a vertex, or about so many by decimation.
+            One a vertex, or so many by `choose_tokens`.
         eigenfunctions : int
             As in `vertex_descriptors`.
+        motion : (M, V, 3), optional
+            Examples of motion for `choose_tokens`.
         """
-        coarse, carriers = mesh, []
+        descriptors, vertices, edges = vertex_descriptors(mesh, eigenfunctions), None, mesh.edges
+        spread = None
         if tokens != "vertices" and int(tokens) < mesh.n_vertices:
-            from meshanim.geometry import prolongation
-
-            spread = prolongation(mesh, int(tokens))
-            coarse, carriers = spread.mesh, [_rows(spread.operator), _rows(spread.restriction)]
-        descriptors = vertex_descriptors(coarse, eigenfunctions)
+            chosen = choose_tokens(mesh, int(tokens), motion)
+            vertices, edges, spread = chosen.vertices, chosen.edges, _rows(chosen.prolongation)
+            descriptors = descriptors[vertices]
         return cls(
             torch.from_numpy(mesh.vertices.astype(np.float32)),
             torch.from_numpy(mesh.faces),
-            torch.from_numpy(coarse.edges),
+            torch.from_numpy(edges),
             torch.from_numpy(descriptors.astype(np.float32)),
             torch.full((len(descriptors),), 1e-3),
-            *carriers,
+            torch.from_numpy(np.arange(mesh.n_vertices) if vertices is None else vertices),
+            spread,
         )
 
     @classmethod
@@ -128,14 +137,12 @@ class VertexTokens(nn.Module):
             If an entry is missing.
         """
         try:
-            vertices, tokens = len(state["template"]), len(state["descriptors"])
-            carriers = {}
-            for name, shape in (("prolongation", (vertices, tokens)), ("restriction", (tokens, vertices))):
-                if f"{name}.values" in state:
-                    parts = (state[f"{name}.{part}"] for part in ("rows", "columns", "values"))
-                    carriers[name] = SparseRows(*parts, shape)
-            names = ("template", "faces", "edges", "descriptors", "amplitude")
-            return cls(*(state[name] for name in names), **carriers)
+            names = ("template", "faces", "edges", "descriptors", "amplitude", "vertices")
+            parts = [state[name] for name in names]
+            if "prolongation.values" in state:
+                entries = (state[f"prolongation.{part}"] for part in ("rows", "columns", "values"))
+                parts.append(SparseRows(*entries, (len(state["template"]), len(state["vertices"]))))
+            return cls(*parts)
         except KeyError as error:
             raise FileFormatError(f"the checkpoint lacks surface.{error.args[0]}") from error
 
@@ -164,8 +171,7 @@ class VertexTokens(nn.Module):
 
     def identity(self, templates: Float[Tensor, "subjects vertices 3"]) -> Float[Tensor, "subjects tokens 3"]:
         """How subjects differ from the reference at each token, in centimetres."""
-        difference = (templates - self.template) * 100
-        return difference if self.restriction is None else self.restriction(difference)
+        return (templates - self.template)[:, self.vertices] * 100
 
     def prolong(self, moved: Float[Tensor, "batch tokens 3"]) -> Float[Tensor, "batch vertices 3"]:
         """Displacements of the tokens to displacements of all vertices."""

@@ -2,13 +2,15 @@
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from meshanim.errors import OptionError
+from meshanim.heads import Head
 
-__all__ = ["LipSeal", "seal_envelope"]
+__all__ = ["LipSeal", "head_lip_seal", "seal_envelope"]
 
 
 def seal_envelope(
@@ -117,3 +119,12 @@ class LipSeal:
 
     def _gaps(self, vertices: Tensor) -> Tensor:
         return vertices[:, self.pairs[:, 0], 1] - vertices[:, self.pairs[:, 1], 1]
+
+
+def head_lip_seal(head: Head | None) -> LipSeal | None:
+    """The seal of a head that declares lip pairs and has ARKit's mouthClose; None for any other."""
+    pairs = getattr(head, "lip_pairs", None)
+    if head is None or pairs is None or "mouthClose" not in head.expression_names:
+        return None
+    closing = head.expression_directions[head.expression_names.index("mouthClose")]
+    return LipSeal(torch.as_tensor(np.asarray(pairs)), closing.unflatten(0, (-1, 3)))

@@ -15,6 +15,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import torch
 from accelerate import Accelerator
 from accelerate.utils import DistributedDataParallelKwargs
+from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from tqdm import tqdm
@@ -151,13 +152,18 @@ class Trainer:
         )
         self.model, self.optimizer = self.accelerator.prepare(model, optimizer)
         self.step = 0
-        bare = self.accelerator.unwrap_model(self.model)
-        self.average = {n: p.detach().clone() for n, p in bare.named_parameters()} if config.ema else {}
+        self.average: dict[str, Tensor] = {}
+        self.reset_average()
 
     @property
     def bare(self) -> nn.Module:
         """The model without the wrappers of distributed training."""
         return self.accelerator.unwrap_model(self.model)
+
+    def reset_average(self) -> None:
+        """Start the moving average from the weights as they are."""
+        if self.config.ema:
+            self.average = {name: p.detach().clone() for name, p in self.bare.named_parameters()}
 
     def run(self, until: int | None = None, progress: bool = True) -> nn.Module:
         """Train from where the run stands to the last step (or to step `until`), and save.
@@ -299,7 +305,7 @@ class Trainer:
         try:
             described = json.loads((found[-1] / "trainer.json").read_text())
             tensors = load_file(found[-1] / "trainer.safetensors")
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, SafetensorError) as error:
             raise FileFormatError(f"{found[-1]} is not a checkpoint of a training run: {error}") from error
         fixed = asdict(self.config)
         for name in ("log_every", "save_every", "keep"):

@@ -1,0 +1,268 @@
+"""What `meshanim evaluate gava` measures: held-out motion, baselines, and speech of real people."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Int
+from tqdm import tqdm
+
+from meshanim.audio import SpeechEncoder, Waveform, load_encoder, log_mel
+from meshanim.audio.features import frame_count
+from meshanim.audio.viseme_evaluation import load_clips
+from meshanim.datasets.meshanim_format import MeshanimDataset, MotionSequence
+from meshanim.errors import OptionError
+from meshanim.heads import Head, load_head
+from meshanim.models.gava import Gava
+from meshanim.models.gava_stream import GavaStream, PoseSmoothing, animate
+from meshanim.motion.lip_seal import LipSeal, head_lip_seal
+from meshanim.results import Results
+from meshanim.training.metrics import (
+    axis_dynamics_deviation,
+    bilabial_closure,
+    eye_vertex_error,
+    lip_aperture,
+    lip_vertex_error,
+    mean_vertex_error,
+    upper_face_dynamics_deviation,
+)
+
+__all__ = ["EvaluateGavaOptions", "evaluate_gava"]
+
+BILABIALS = ("P", "B", "M")
+OPEN_VOWELS = ("AA", "AE", "AY", "AW", "AO")
+CLOSED_BELOW, OPEN_ABOVE = 1e-3, 4e-3
+"""Metres of lip aperture that count as closed lips and as an open mouth where there is no truth."""
+
+Motion = Float32[np.ndarray, "frames vertices 3"]
+
+
+@dataclass(frozen=True)
+class EvaluateGavaOptions:
+    """Measure a GAVA checkpoint on held-out sequences, beside baselines.
+
+    Example: meshanim evaluate gava --data corpus --json results.json
+    """
+
+    data: Path
+    """Folder of a data set in the project's format."""
+    model: str = "default"
+    """default, or a folder that meshanim train gava wrote."""
+    compare: tuple[Path, ...] = ()
+    """Folders of other checkpoints for the same table, such as one with --decoder mlp --features G."""
+    splits: tuple[str, ...] = ("test", "test_unseen")
+    """Splits of the data set."""
+    human: Path | None = None
+    """Folder of recorded speech, each file with NAME.txt that says what is spoken."""
+    json: Path | None = None
+    """Where to write the rows."""
+
+
+def evaluate_gava(options: EvaluateGavaOptions, progress: bool = True) -> Results:
+    """Fill the table: lip, eye and mean vertex error, FDD, AFDD and the share of bilabials that close.
+
+    Raises
+    ------
+    FileFormatError, OptionError
+        If the data set or a checkpoint cannot be read, or they do not fit together.
+    """
+    dataset = MeshanimDataset(options.data)
+    models = {}
+    for name in (options.model, *map(str, options.compare)):
+        model = load_gava(name)
+        if model.n_vertices != dataset.mesh.n_vertices:
+            raise OptionError(
+                f"{name} animates {model.n_vertices} vertices, {options.data} has {dataset.mesh.n_vertices}"
+            )
+        models[describe(name, model)] = model
+    head = load_head(dataset.head) if dataset.head else None
+    still = mean_displacement(dataset)
+    methods: dict[str, Callable[[MotionSequence], Motion]] = {
+        "template held still": lambda s: np.repeat(
+            dataset.subjects[s.info.subject].template[None], len(s), 0
+        ),
+        "mean of training": lambda s: np.repeat(
+            (dataset.subjects[s.info.subject].template + still)[None], len(s), 0
+        ),
+    }
+    for name, model in models.items():
+        encoder = load_encoder(model.config.encoder)
+        methods[name] = speaker(model, encoder, dataset, None)
+        seal = head_lip_seal(head)
+        if seal is not None and getattr(encoder, "bilabial", None) is not None:
+            methods[f"{name} + lip seal"] = speaker(model, encoder, dataset, seal)
+    results = Results("evaluate gava")
+    for split in options.splits:
+        for name, predict in methods.items():
+            for metric, (value, unit) in measure(
+                dataset, head, split, predict, f"{split}: {name}", progress
+            ).items():
+                results.add(split, name, metric, value, unit)
+    if head is not None and getattr(head, "lip_pairs", None) is not None:
+        rows = articulation(
+            (
+                (s.vertices, s.phonemes, s.info.fps)
+                for s in map(dataset.__getitem__, dataset.split(options.splits[0]))
+            ),
+            head.lip_pairs,
+        )
+        for metric, value in rows.items():
+            results.add(options.splits[0], "truth", metric, value, "share")
+        if options.human is not None:
+            clips = load_clips(options.human)
+            for name, model in models.items():
+                encoder = load_encoder(model.config.encoder)
+                for label, seal in ((name, None), (f"{name} + lip seal", head_lip_seal(head))):
+                    moved = (
+                        (spoken(model, encoder, clip.waveform, seal=seal), clip.phonemes, model.config.fps)
+                        for clip in clips
+                    )
+                    for metric, value in articulation(moved, head.lip_pairs).items():
+                        results.add("human clips", label, metric, value, "share")
+    if options.json is not None:
+        results.save(options.json)
+    return results
+
+
+def load_gava(name: str) -> Gava:
+    """A checkpoint by name or folder."""
+    from meshanim.animator import Animator
+
+    return Animator.from_pretrained(name).model
+
+
+def describe(name: str, model: Gava) -> str:
+    """Short name for tables: the ablation's, with the checkpoint's name where it is not the default."""
+    kind = f"{model.config.features}+{model.config.decoder.upper()}"
+    return kind if name == "default" else f"{kind} ({Path(name).parent.name or name})"
+
+
+def mean_displacement(dataset: MeshanimDataset) -> Float32[np.ndarray, "vertices 3"]:
+    """Mean displacement from the template over all training frames."""
+    total, frames = np.zeros((dataset.mesh.n_vertices, 3)), 0
+    for name in dataset.split("train"):
+        sequence = dataset[name]
+        moved = np.asarray(sequence.vertices) - dataset.subjects[sequence.info.subject].template
+        total += moved.sum(0, dtype=np.float64)
+        frames += len(sequence)
+    return (total / max(frames, 1)).astype(np.float32)
+
+
+def spoken(
+    model: Gava,
+    encoder: SpeechEncoder,
+    audio: Waveform,
+    template: Float32[np.ndarray, "vertices 3"] | None = None,
+    style: torch.Tensor | None = None,
+    frames: int | None = None,
+    fps: float | None = None,
+    seal: LipSeal | None = None,
+) -> Motion:
+    """Vertices of a whole speech, zero pose, as the animator gives them without idle motion."""
+    fps = model.config.fps if fps is None else fps
+    stream = GavaStream(
+        model,
+        None if template is None else torch.from_numpy(template),
+        style,
+        fps,
+        PoseSmoothing(0),
+        seal,
+        None if seal is None else getattr(encoder, "bilabial", None),
+    )
+    mel = log_mel(audio) if model.config.pose else None
+    count = frame_count(audio, fps) if frames is None else frames
+    parts = animate(stream, encoder(audio).float(), mel, count)
+    return torch.cat([part.vertices for part in parts]).numpy()
+
+
+def speaker(
+    model: Gava, encoder: SpeechEncoder, dataset: MeshanimDataset, seal: LipSeal | None
+) -> Callable[[MotionSequence], Motion]:
+    """A function that speaks a sequence with its subject's template, style and emotion."""
+    known = model.config
+
+    def predict(sequence: MotionSequence) -> Motion:
+        info = sequence.info
+        subject = info.subject if info.subject in known.subjects else None
+        emotion = info.emotion if info.emotion in known.emotions else "neutral"
+        with torch.no_grad():
+            style = model.style_of(subject, emotion, float(info.intensity))
+        template = dataset.subjects[info.subject].template
+        return spoken(model, encoder, sequence.audio, template, style, info.frames, info.fps, seal)
+
+    return predict
+
+
+def measure(
+    dataset: MeshanimDataset,
+    head: Head | None,
+    split: str,
+    predict: Callable[[MotionSequence], Motion],
+    label: str,
+    progress: bool,
+) -> dict[str, tuple[float, str]]:
+    """Every metric that the regions allow: errors are means over frames, deviations means over sequences."""
+    regions: Mapping[str, np.ndarray] = {} if head is None else head.regions
+    eyes = np.union1d(regions.get("eyelids", []), regions.get("eyes", [])).astype(np.int64)
+    pairs = getattr(head, "lip_pairs", None)
+    frames: list[int] = []
+    columns: dict[str, list[float]] = {}
+    closed: list[bool] = []
+    names = dataset.split(split)
+    for name in tqdm(names, desc=label, unit="clip", disable=not progress):
+        sequence = dataset[name]
+        true, found = np.asarray(sequence.vertices), predict(sequence)
+        values = {"mean vertex error": mean_vertex_error(found, true)}
+        if len(regions.get("lips", [])):
+            values["lip vertex error"] = lip_vertex_error(found, true, regions["lips"])
+        if len(eyes):
+            values["eye vertex error"] = eye_vertex_error(found, true, eyes)
+        if len(regions.get("upper_face", [])):
+            upper = regions["upper_face"]
+            template = dataset.subjects[sequence.info.subject].template
+            values["FDD"] = upper_face_dynamics_deviation(found, true, template, upper)
+            values["AFDD"] = axis_dynamics_deviation(found, true, upper)
+        for metric, value in values.items():
+            columns.setdefault(metric, []).append(value)
+        frames.append(len(sequence))
+        if pairs is not None:
+            spans = [(p.start, p.end) for p in sequence.phonemes if p.symbol in BILABIALS]
+            closed += bilabial_closure(found, true, pairs, spans, sequence.info.fps)
+    rows = {}
+    for metric, values in columns.items():
+        weights = None if metric in ("FDD", "AFDD") else frames
+        rows[metric] = (float(np.average(values, weights=weights)), "mm")
+    if closed:
+        rows["bilabials closed"] = (float(np.mean(closed)), "share")
+    return rows
+
+
+def articulation(spoken_clips, pairs: Int[np.ndarray, "pairs 2"]) -> dict[str, float]:
+    """Share of bilabials with closed lips and of open vowels with an open mouth, by aperture alone.
+
+    Parameters
+    ----------
+    spoken_clips : iterable of (vertices, phonemes, fps)
+        Zero pose.
+    pairs : (P, 2) int
+        Lip pairs.
+    """
+    closed: list[bool] = []
+    opened: list[bool] = []
+    for vertices, phonemes, fps in spoken_clips:
+        aperture = lip_aperture(np.asarray(vertices), pairs)
+        closed += [low < CLOSED_BELOW for low, _ in _extremes(aperture, phonemes, BILABIALS, fps)]
+        opened += [high > OPEN_ABOVE for _, high in _extremes(aperture, phonemes, OPEN_VOWELS, fps)]
+    shares = {"bilabials with closed lips": closed, "open vowels with open mouth": opened}
+    return {name: float(np.mean(values)) for name, values in shares.items() if values}
+
+
+def _extremes(aperture: np.ndarray, phonemes: Sequence, symbols: Sequence[str], fps: float):
+    for phoneme in phonemes:
+        if phoneme.symbol in symbols:
+            first = max(0, int(np.floor(phoneme.start * fps)) - 1)
+            part = aperture[first : int(np.ceil(phoneme.end * fps)) + 1]
+            if len(part):
+                yield float(part.min()), float(part.max())

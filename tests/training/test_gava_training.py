@@ -1,0 +1,107 @@
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from corpus_small import FPS, write_small_corpus
+
+from meshanim.datasets.meshanim_format import MeshanimDataset
+from meshanim.errors import OptionError
+from meshanim.models.gava import Gava
+from meshanim.training.gava import TrainGavaOptions, train_gava
+from meshanim.training.gava_evaluation import EvaluateGavaOptions, evaluate_gava
+from meshanim.training.speech_motion import Clip
+from meshanim.training.trainer import TrainConfig
+from meshanim.training.warm_start import WarmStart, motion_components
+
+
+@pytest.fixture(scope="module")
+def corpus(tmp_path_factory):
+    return write_small_corpus(tmp_path_factory.mktemp("corpus") / "sphere")
+
+
+def options(corpus, output, **changes):
+    defaults = {
+        "data": corpus,
+        "output": output,
+        "encoder": "mel",
+        "width": 16,
+        "heads": 2,
+        "rank": 12,
+        "variants": 0,
+        "batch_windows": 6,
+        "tokens": 80,
+        "cpu": True,
+        "train": TrainConfig(steps=40, learning_rate=5e-3, log_every=1000, save_every=1000),
+    }
+    return TrainGavaOptions(**(defaults | changes))
+
+
+def errors(corpus, models):
+    first, *others = map(str, models)
+    results = evaluate_gava(
+        EvaluateGavaOptions(corpus, first, tuple(others), splits=("train", "test")), False
+    )
+    return {(r.case, r.implementation): r.value for r in results.rows if r.metric == "mean vertex error"}
+
+
+def test_it_learns_to_speak_from_a_random_start(corpus, tmp_path):
+    model = train_gava(options(corpus, tmp_path / "plain"), progress=False)
+    found = errors(corpus, [model])
+    assert found["train", "LG+GAVA (plain)"] < 0.5 * found["train", "template held still"]
+    loaded = Gava.from_pretrained(model)
+    assert loaded.config.subjects == ("anna", "ben")
+    assert loaded.config.emotions == ("neutral", "joy")
+    assert loaded.config.fps == FPS
+    assert loaded.config.encoder == "mel"
+
+
+@pytest.mark.parametrize(
+    "changes", [{}, {"decoder": "mlp", "features": "G"}, {"tokens": 60, "fusion": "concat"}]
+)
+def test_a_warm_start_is_near_the_answer(corpus, tmp_path, changes):
+    warm = WarmStart(steps=60, batch_windows=8, components=3, learning_rate=1e-2, field_steps=80)
+    train = TrainConfig(steps=8, learning_rate=1e-3, log_every=1000, save_every=1000, ema=0.9)
+    model = train_gava(options(corpus, tmp_path / "warm", warm=warm, train=train, **changes), progress=False)
+    found = errors(corpus, [model])
+    (name,) = {name for _, name in found} - {"template held still", "mean of training"}
+    assert (
+        found["test", name] < (0.9 if changes.get("decoder") else 0.6) * found["test", "template held still"]
+    )
+    assert found["test", name] < found["test", "mean of training"]
+
+
+def test_a_run_goes_on_where_it_was_cut(corpus, tmp_path):
+    train = TrainConfig(steps=6, learning_rate=1e-3, log_every=1000, save_every=3)
+    whole = train_gava(options(corpus, tmp_path / "whole", train=train), progress=False)
+    first = tmp_path / "cut"
+    train_gava(options(corpus, first, train=train), progress=False)
+    for folder in (first / "checkpoints" / "0000006", first / "model"):
+        (folder / "model.safetensors").unlink()
+    shutil.rmtree(first / "checkpoints" / "0000006")
+    again = train_gava(options(corpus, first, train=train), progress=False)
+    a, b = (Gava.from_pretrained(folder).state_dict() for folder in (whole, again))
+    assert all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_components_are_the_motion(corpus):
+    dataset = MeshanimDataset(corpus)
+    templates = np.stack([subject.template for subject in dataset.subjects.values()])
+    clips = []
+    for name in dataset.split("train"):
+        sequence = dataset[name]
+        row = list(dataset.subjects).index(sequence.info.subject)
+        clips.append(Clip(sequence.info, row, 0, 0, 0.0, sequence.vertices, sequence.pose, [], []))
+    components = motion_components(clips, templates, 3)
+    assert components.scale[0] > 100 * components.scale[1]  # one field moves it all
+    moved = clips[0].vertices - templates[0]
+    rebuilt = np.tensordot(components.coefficients(moved).numpy() * components.scale, components.modes, 1)
+    np.testing.assert_allclose(rebuilt, moved, atol=1e-6)
+
+
+def test_bad_options_are_named(corpus, tmp_path):
+    warm = WarmStart(steps=1, components=8)
+    with pytest.raises(OptionError, match="rank of at least"):
+        train_gava(options(corpus, tmp_path, warm=warm), progress=False)
+    with pytest.raises(OptionError, match="two consecutive"):
+        train_gava(options(corpus, tmp_path, window_frames=1), progress=False)
