@@ -48,3 +48,7 @@ class DependencyError(MeshanimError):
 
     def __init__(self, package: str, extra: str):
         super().__init__(f"{package} is not installed: pip install 'meshanim[{extra}]'")
+        self.package, self.extra = package, extra
+
+    def __reduce__(self) -> tuple:
+        return DependencyError, (self.package, self.extra)  # crosses from a worker process to its parent

@@ -29,10 +29,9 @@ _CLOSED_SHARE = {"P": 0.80, "B": 0.90, "M": 1.0}
 """Share of a bilabial that is closed; the rest of P and B is burst and breath."""
 _LABIODENTAL = {
     "jawOpen": 0.02,
-    "mouthRollLower": 0.90,
-    "mouthShrugLower": 0.10,
-    "mouthPress": 0.20,
-    "mouthUpperUp": 0.50,
+    "mouthRollLower": 0.55,
+    "mouthShrugLower": 0.32,
+    "mouthUpperUp": 0.46,
 }
 _SEALED_JAW = 0.12
 
@@ -277,7 +276,9 @@ def articulate(
     curves["mouthClose"] = np.zeros(len(at))
     for name in curves:
         curves[name] = curves[name] * (1 - labiodental) + _LABIODENTAL.get(name, 0.0) * labiodental
-    jaw = np.clip(curves["jawOpen"], 0, 1)
+    # Speech opens the jaw to about two thirds of what it can do, however loud.
+    jaw = np.maximum(curves["jawOpen"], 0)
+    jaw = np.where(jaw < 0.4, jaw, 0.4 + 0.25 * np.tanh((jaw - 0.4) / 0.25))
     jaw = jaw - sealed * np.maximum(jaw - _SEALED_JAW, 0) * 0.6
     for name in ("mouthLowerDown", "mouthUpperUp", "mouthFunnel", "tongueOut"):
         curves[name] = curves[name] * (1 - sealed)

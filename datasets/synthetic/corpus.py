@@ -1,5 +1,6 @@
 """The embedded corpus: who speaks which sentence how, acted out and written."""
 
+import hashlib
 import json
 import math
 import multiprocessing
@@ -83,8 +84,8 @@ class SynthesizeOptions:
 
     @property
     def recorded(self) -> dict[str, str | int | float]:
-        """What decides the content of the files: all but the folder and the number of workers."""
-        texts = "" if self.texts is None else str(self.texts)
+        """What decides the content of the files: all options but the folder and the workers."""
+        texts = hashlib.sha256("\n".join(_texts(self)).encode()).hexdigest()[:16]
         chosen = {key: value for key, value in asdict(self).items() if key not in ("directory", "workers")}
         return {**chosen, "texts": texts, "version": __version__}
 
@@ -129,7 +130,7 @@ def cast(options: SynthesizeOptions, shapes: int, available: list[str]) -> list[
     members = []
     for index in range(options.subjects):
         generator = np.random.default_rng([options.seed, index, 0xCA57])
-        shape = np.clip(generator.normal(size=shapes), -2, 2)
+        shape = np.clip(generator.normal(size=shapes) * 0.8, -2, 2)
         # The first of each voice speaks as it is, later ones are moved in rate and pitch.
         again = index >= len(human)
         factors = (

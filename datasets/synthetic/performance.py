@@ -1,7 +1,7 @@
 """From timed phonemes and prosody to a whole performance: face curves and head pose."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -205,16 +205,15 @@ def perform(
     def gain(value: float) -> float:
         return 1 + intensity * (value - 1)
 
-    spoken = SpeakingStyle(
-        **{
-            **style.__dict__,
-            "jaw": min(style.jaw * gain(feeling.jaw), 3.0),
-            "lips": min(style.lips * gain(feeling.lips), 3.0),
-        }
+    spoken = replace(
+        style,
+        jaw=min(style.jaw * gain(feeling.jaw), 3.0),
+        lips=min(style.lips * gain(feeling.lips), 3.0),
     )
     mouth, seal, labiodental = articulate(parts, at, prosody.loudness, prosody.accent, spoken, closing)
     curves = _spread_sides(mouth, style.asymmetry)
 
+    tilt = feeling.head_tilt
     pose = pose_from_prosody(
         frames,
         fps,
@@ -223,14 +222,21 @@ def perform(
         pitch,
         rate,
         style.head * gain(feeling.head),
-        tuple(intensity * value for value in feeling.head_tilt),
+        (intensity * tilt[0], intensity * tilt[1], intensity * tilt[2]),
     )
     streams = [np.random.default_rng([seed, 0xFACE, index]) for index in range(4)]
     upper = brows(count, prosody.accent, prosody.contour, streams[0])
     for name, track in upper.items():
         curves[name] = style.brows * gain(feeling.brows) * np.interp(at, grid, track)
     curves.update(
-        gaze(at, duration, pose, tuple(intensity * value for value in feeling.gaze), style.gaze, streams[1])
+        gaze(
+            at,
+            duration,
+            pose,
+            (intensity * feeling.gaze[0], intensity * feeling.gaze[1]),
+            style.gaze,
+            streams[1],
+        )
     )
 
     free = 1 - np.maximum(seal, labiodental)

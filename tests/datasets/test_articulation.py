@@ -98,7 +98,7 @@ def test_contacts_and_ranges(phonemes, fps, style, emotion, seed):
     st.sampled_from(sorted(OPEN)),
     st.sampled_from(["T", "K", "P", "HH", "S"]),
     st.sampled_from(RATES),
-    st.floats(0.1, 0.25),
+    st.floats(0.12, 0.25),
 )
 def test_open_vowels_open(vowel, consonant, fps, length):
     phonemes = timed(("SIL", 0.3), (consonant, 0.08), (vowel, length), (consonant, 0.08), ("SIL", 0.3))
@@ -106,8 +106,8 @@ def test_open_vowels_open(vowel, consonant, fps, length):
     times = (np.arange(len(performance)) + 0.5) / fps
     inside = (times > 0.38) & (times < 0.38 + length)
     opening = performance.curve("jawOpen") - performance.curve("mouthClose")
-    assert opening[inside].max() > 0.17
-    assert performance.curve("lipSeal")[inside].min() < 0.05
+    assert opening[inside].max() > 0.14  # 4 mm between the lips
+    assert performance.curve("lipSeal")[inside].min() < 0.15
 
 
 def test_neighbours_are_felt():

@@ -159,12 +159,20 @@ def test_a_folder_of_something_else_is_left_alone(corpus, tmp_path):
         synthesize(options_for(tmp_path), progress=False)
     with pytest.raises(OptionError, match="begun with seed 0"):
         synthesize(options_for(corpus, seed=5), progress=False)
+    (tmp_path / "texts").write_text("Papa moved.\nMama moved too.\n")
+    with pytest.raises(OptionError, match="begun with texts"):
+        synthesize(options_for(corpus, texts=tmp_path / "texts"), progress=False)
 
 
 def test_no_voice_names_the_extra(monkeypatch, tmp_path):
     monkeypatch.setattr("meshanim.datasets.synthetic.corpus.voices", list)
     with pytest.raises(DependencyError, match="speech"):
         synthesize(options_for(tmp_path / "none"), progress=False)
+
+
+def test_a_missing_package_is_named_from_a_worker_too():
+    error = pickle.loads(pickle.dumps(DependencyError("pocketsphinx", "speech")))
+    assert "meshanim[speech]" in str(error)
 
 
 def test_bad_options_are_named(tmp_path):
