@@ -1,6 +1,7 @@
 """Mending meshes by pymeshlab, so that the operators of the other modules take them."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pymeshlab
@@ -85,26 +86,24 @@ def repair(
     if merge_distance is not None:
         # A zero threshold would merge nothing; this is below any two distinct positions of a head.
         threshold = pymeshlab.PureValue(max(merge_distance, 1e-12))
-        changes["merged vertices"] = work.step("meshing_merge_close_vertices", threshold=threshold)[0]
+        changes["merged vertices"] = work.step("meshing_merge_close_vertices", {"threshold": threshold})[0]
     changes["duplicate faces"] = work.step("meshing_remove_duplicate_faces")[1]
     if non_manifold == "remove":
-        gone = work.step("meshing_repair_non_manifold_edges", method="Remove Faces")[1]
+        gone = work.step("meshing_repair_non_manifold_edges", {"method": "Remove Faces"})[1]
         changes["faces at non-manifold edges"] = gone
+    if not len(work.faces()):
+        raise MeshError(f"no usable triangle is left of {len(faces)}; is merge_distance too large?")
     work.split_fans()
-    if len(zero_area_faces(vertices[work.origin()], work.faces())):
-        work.step("meshing_remove_t_vertices", method="Edge Flip", threshold=1e6, repeat=True)
-        changes["triangles without area"] = work.step("meshing_remove_null_faces")[1]
-        flat = zero_area_faces(vertices[work.origin()], work.faces())
-        if len(flat) == len(work.faces()):
-            raise MeshError(f"no triangle of {len(faces)} has an area")
-        work.split_fans()
+    if len(work.flat_faces()):
+        work.step("meshing_remove_t_vertices", {"method": "Edge Flip", "threshold": 1e6, "repeat": True})
+        changes["triangles without area"] = work.remove_flat_faces()
     if orient:
         before = work.faces()
         work.step("meshing_re_orient_faces_coherently")
         changes["turned faces"] = _turned(before, work.faces())
     if fill_holes:
-        filled = work.step("meshing_close_holes", maxholesize=fill_holes, newfaceselected=False)[1]
-        changes["faces in holes"] = -filled
+        filled = work.step("meshing_close_holes", {"maxholesize": fill_holes, "newfaceselected": False})[1]
+        changes["faces in holes"] = -filled - work.remove_flat_faces()
     work.step("meshing_remove_unreferenced_vertices")
     vertex = work.origin()
     used = len(np.unique(vertex))
@@ -133,10 +132,10 @@ class _Workpiece:
             )
         )
 
-    def step(self, name: str, **options) -> tuple[int, int]:
+    def step(self, name: str, options: dict[str, Any] | None = None) -> tuple[int, int]:
         """Apply a filter; how many vertices and faces went."""
         vertices, faces = self._count()
-        self.set.apply_filter(name, **options)
+        self.set.apply_filter(name, **(options or {}))
         after_vertices, after_faces = self._count()
         return vertices - after_vertices, faces - after_faces
 
@@ -145,6 +144,19 @@ class _Workpiece:
         faces, source = _split_fans(self.faces(), self._count()[0])
         if len(source) > self._count()[0]:
             self._load(self.set.current_mesh().vertex_matrix()[source], faces, self.origin()[source])
+
+    def flat_faces(self) -> np.ndarray:
+        return zero_area_faces(self.set.current_mesh().vertex_matrix(), self.faces())
+
+    def remove_flat_faces(self) -> int:
+        """Remove triangles without area and split the fans that this leaves; how many went."""
+        flat, faces = self.flat_faces(), self.faces()
+        if len(flat) == len(faces):
+            raise MeshError("no triangle has an area")
+        if len(flat):
+            self._load(self.set.current_mesh().vertex_matrix(), np.delete(faces, flat, axis=0), self.origin())
+            self.split_fans()
+        return len(flat)
 
     def faces(self) -> np.ndarray:
         return np.asarray(self.set.current_mesh().face_matrix(), np.int64).reshape(-1, 3)

@@ -97,6 +97,8 @@ def test_refusals():
         repair(mesh.vertices, mesh.faces + 1)
     with pytest.raises(MeshError, match="no usable triangle"):
         repair(np.full((3, 3), np.nan), np.array([[0, 1, 2]]))
+    with pytest.raises(MeshError, match="merge_distance"):
+        repair(mesh.vertices, mesh.faces, merge_distance=10.0)
     with pytest.raises(OptionError, match="non_manifold"):
         repair(mesh.vertices, mesh.faces, non_manifold="weld")
     with pytest.raises(OptionError, match="negative"):
