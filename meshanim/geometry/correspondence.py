@@ -128,8 +128,8 @@ def surface_correspondence(
 
 def _initial_alignment(source: TriangleMesh, target: TriangleMesh, landmarks: np.ndarray) -> Similarity:
     if len(landmarks):
-        pairs = source.vertices[landmarks[:, 0]], target.vertices[landmarks[:, 1]]
-        return align(*(torch.from_numpy(points) for points in pairs), scaling=True)
+        held, goals = source.vertices[landmarks[:, 0]], target.vertices[landmarks[:, 1]]
+        return align(torch.from_numpy(held), torch.from_numpy(goals), scaling=True)
     points, areas = source.vertices, source.mass.diagonal()
     scale = _radius(target) / _radius(source)
     offset = (target.vertices.min(0) + target.vertices.max(0) - scale * (points.min(0) + points.max(0))) / 2

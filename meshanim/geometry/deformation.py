@@ -156,9 +156,9 @@ class DeformationTransfer:
             gradients[:, follows] = (self.rotation @ found @ self.rotation.T)[:, index]
             # igl stacks the x, y and z derivatives of all faces; columns are coordinates of frames.
             wanted = gradients.transpose(3, 1, 0, 2).reshape(3 * self.target.n_faces, count * 3)
-            positions = np.zeros((self.target.n_vertices, count * 3))
-            positions[self._free] = self._factor.solve((self._divergence @ wanted)[self._free])
-            positions = positions.reshape(-1, count, 3).transpose(1, 0, 2)
+            columns = np.zeros((self.target.n_vertices, count * 3))
+            columns[self._free] = self._factor.solve((self._divergence @ wanted)[self._free])
+            positions = columns.reshape(-1, count, 3).transpose(1, 0, 2)
 
             moves = np.zeros((count, self.target.n_faces, 3))
             centres = chunk[:, counterpart].mean(2) - self.source.vertices[counterpart].mean(1)

@@ -60,6 +60,8 @@ class TriangleMesh:
                 raise ShapeError(f"uv_faces has {len(self.uv_faces)} rows, faces {len(self.faces)}")
             _check_indices(self.uv_faces, len(self.uv), "uv_faces", "uv")
 
+        self._eigenbasis: tuple[np.ndarray, np.ndarray] | None = None
+
     @property
     def n_vertices(self) -> int:
         return len(self.vertices)
@@ -94,7 +96,7 @@ class TriangleMesh:
 
     def eigenbasis(self, k: int) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "vertices k"]]:
         """The k lowest Laplace-Beltrami eigenvalues (1/m²) and mass-orthonormal eigenvectors, kept."""
-        if not hasattr(self, "_eigenbasis") or not 1 <= k <= len(self._eigenbasis[0]):
+        if self._eigenbasis is None or not 1 <= k <= len(self._eigenbasis[0]):
             self._eigenbasis = laplacian.eigenbasis(self.laplacian, self.mass, k)
         values, vectors = self._eigenbasis
         return values[:k], vectors[:, :k]
