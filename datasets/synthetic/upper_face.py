@@ -36,9 +36,8 @@ def blinks(
     generator : numpy.random.Generator
         Chance.
     """
-    pauses = np.array(
-        [part.start for part in parts if part.phoneme == SILENCE and part.end - part.start > 0.08]
-    )
+    silent = [part for part in parts if part.phoneme == SILENCE and part.end - part.start > 0.08]
+    pauses = np.array([part.start for part in silent if part.start > 0])
     result = np.zeros(len(at))
     if rate <= 0:
         return result
