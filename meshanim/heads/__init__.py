@@ -2,6 +2,7 @@
 
 from meshanim.errors import OptionError
 from meshanim.heads.default import DefaultHead, HeadPart, load_default_head
+from meshanim.heads.flame import FlameHead, load_flame
 from meshanim.heads.head import JOINT_NAMES, JOINT_PARENTS, REGION_NAMES, Head, HeadParameters
 from meshanim.heads.skinning import joint_transforms, linear_blend_skinning
 
@@ -10,13 +11,18 @@ __all__ = [
     "JOINT_PARENTS",
     "REGION_NAMES",
     "DefaultHead",
+    "FlameHead",
     "Head",
     "HeadParameters",
     "HeadPart",
     "joint_transforms",
     "linear_blend_skinning",
+    "load_flame",
     "load_head",
 ]
+
+
+FLAME_KINDS = {"flame": "none", "flame+teeth": "plain", "flame+split_teeth": "split"}
 
 
 def load_head(name: str = "default") -> Head:
@@ -25,13 +31,19 @@ def load_head(name: str = "default") -> Head:
     Parameters
     ----------
     name : str
-        "default", the head of the library.
+        "default", the head of the library; "flame:PATH", "flame+teeth:PATH" or "flame+split_teeth:PATH",
+        FLAME from its own file (`load_flame`).
 
     Raises
     ------
     OptionError
         If the name is of another form.
+    FileFormatError
+        If the file is missing, damaged or of another kind.
     """
+    kind, _, path = name.partition(":")
     if name == "default":
         return load_default_head()
-    raise OptionError(f"no head named {name}; there is default")
+    if kind in FLAME_KINDS and path:
+        return load_flame(path, FLAME_KINDS[kind])
+    raise OptionError(f"no head named {name}; there are default and {':PATH, '.join(FLAME_KINDS)}:PATH")
