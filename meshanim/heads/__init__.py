@@ -4,6 +4,8 @@ from meshanim.errors import OptionError
 from meshanim.heads.default import DefaultHead, HeadPart, load_default_head
 from meshanim.heads.flame import FlameHead, load_flame
 from meshanim.heads.head import JOINT_NAMES, JOINT_PARENTS, REGION_NAMES, Head, HeadParameters
+from meshanim.heads.rig import load_rig, read_rig
+from meshanim.heads.rig_data import Rig
 from meshanim.heads.skinning import joint_transforms, linear_blend_skinning
 
 __all__ = [
@@ -15,10 +17,13 @@ __all__ = [
     "Head",
     "HeadParameters",
     "HeadPart",
+    "Rig",
     "joint_transforms",
     "linear_blend_skinning",
     "load_flame",
     "load_head",
+    "load_rig",
+    "read_rig",
 ]
 
 
@@ -32,7 +37,7 @@ def load_head(name: str = "default") -> Head:
     ----------
     name : str
         "default", the head of the library; "flame:PATH", "flame+teeth:PATH" or "flame+split_teeth:PATH",
-        FLAME from its own file (`load_flame`).
+        FLAME from its own file (`load_flame`); "rig:PATH", blendshapes from a file or folder (`load_rig`).
 
     Raises
     ------
@@ -46,4 +51,8 @@ def load_head(name: str = "default") -> Head:
         return load_default_head()
     if kind in FLAME_KINDS and path:
         return load_flame(path, FLAME_KINDS[kind])
-    raise OptionError(f"no head named {name}; there are default and {':PATH, '.join(FLAME_KINDS)}:PATH")
+    if kind == "rig" and path:
+        return load_rig(path)
+    raise OptionError(
+        f"no head named {name}; there are default, rig:PATH, {':PATH, '.join(FLAME_KINDS)}:PATH"
+    )
