@@ -35,14 +35,15 @@ def default_regions(
     skin[parts["skin"]] = True
     outer = skin & (masks["inside-mouth"] < 0.5)
     travel = np.max([np.linalg.norm(shapes[name], axis=1) for name in UPPER_FACE_SHAPES], axis=0)
+    blink = np.max([np.linalg.norm(shapes[f"eyeBlink{side}"], axis=1) for side in ("Left", "Right")], axis=0)
     ears = outer & (masks["ears"] > 0.5)
     face = outer & (masks["face"] > 0.5)
     neck = outer & (y < -0.06) & ~face & ~ears
     nose = face & (np.abs(x) < 0.021) & (y > -0.021) & (y < 0.03) & (z > 0.062 + 0.4 * np.abs(x))
     by_mask = {
         "lips": outer & (masks["lips"] > 0.5),
-        "upper_face": outer & (travel > 0.0007) & (y > 0.012) & ~nose & ~ears,
-        "eyelids": outer & (masks["eyelids"] > 0.5),
+        "upper_face": outer & ((travel > 0.0007) | (masks["eyelids"] > 0.5)) & (y > 0.012) & ~nose & ~ears,
+        "eyelids": outer & ((masks["eyelids"] > 0.5) | (blink > 0.0015)),
         "jaw": outer & (weights[:, 2] > 0.5),
         "nose": nose,
         "ears": ears,
