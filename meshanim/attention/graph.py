@@ -11,16 +11,22 @@ from torch import Tensor
 
 from meshanim.errors import MeshError, OptionError, ShapeError
 
-__all__ = ["MeshGraph"]
+__all__ = ["MeshGraph", "locality_order"]
+
+# Rows further apart than this seldom share a cache. Reading in sequence outweighs a better order of
+# visits until most neighbours are that far: at 100,000 vertices in random numbering the better order wins by a
+# third; in the numbering that decimation leaves there, and on meshes that fit a cache, it loses.
+FAR = 4096
 
 
 @dataclass(frozen=True, eq=False)
 class MeshGraph:
     """Allowed pairs of query and key, one edge a pair, sorted by query; make it with `from_faces`.
 
-    Rows are stored in the order in which the kernels visit them: `order` lists the vertices so that
-    neighbours are close (reverse Cuthill-McKee), whatever the numbering of the mesh; features stay in the
-    mesh's own order. All tensors are int32.
+    Rows are stored in the order in which the kernels visit them. That is the mesh's own numbering, or, where
+    most neighbours are far apart in it, reverse Cuthill-McKee; features stay in the mesh's numbering either
+    way. A model that numbers its tokens by `locality_order` from the start runs faster still. All tensors are
+    int32.
 
     The global token, where there is one, is the last token. It attends to all tokens, itself included, and
     no vertex attends to it. Its row is implied, not stored.
@@ -135,9 +141,8 @@ class MeshGraph:
 
     @classmethod
     def _from_pairs(cls, queries: np.ndarray, keys: np.ndarray, n: int, global_token: bool) -> "MeshGraph":
-        pattern = _pattern(queries, keys, n)
-        order = reverse_cuthill_mckee(_pattern_of(pattern + pattern.T), symmetric_mode=True) if n else []
-        order = np.asarray(order, np.int64)
+        far = np.abs(queries - keys)[queries != keys] > FAR
+        order = np.arange(n) if not far.size or far.mean() <= 0.5 else locality_order(queries, keys, n)
         rank = np.empty(n, np.int64)
         rank[order] = np.arange(n)
         by_query = np.lexsort((rank[keys], rank[queries]))
@@ -186,6 +191,15 @@ class MeshGraph:
         if self.global_token:
             mask[-1] = True
         return mask
+
+
+def locality_order(
+    queries: Int[np.ndarray, " edges"], keys: Int[np.ndarray, " edges"], n_vertices: int
+) -> Int[np.ndarray, " vertices"]:
+    """The vertices in an order in which neighbours are close (reverse Cuthill-McKee)."""
+    pattern = _pattern(queries, keys, n_vertices)
+    order = reverse_cuthill_mckee(_pattern_of(pattern + pattern.T), symmetric_mode=True)
+    return order.astype(np.int64)
 
 
 def _pattern(rows: np.ndarray, columns: np.ndarray, n: int) -> sp.csr_array:

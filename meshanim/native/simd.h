@@ -131,8 +131,12 @@ inline void store(float *p, Floats a) { std::memcpy(p, a.lane, sizeof a); }
 inline Floats load_first(const float *p, int n) { return each([&](int i) { return i < n ? p[i] : 0.0f; }); }
 inline void store_first(float *p, Floats a, int n) { std::memcpy(p, a.lane, n * sizeof(float)); }
 inline Floats fma(Floats a, Floats b, Floats c) { return a * b + c; }
-inline Floats maximum(Floats a, Floats b) { return each([&](int i) { return a.lane[i] > b.lane[i] ? a.lane[i] : b.lane[i]; }); }
-inline Floats minimum(Floats a, Floats b) { return each([&](int i) { return a.lane[i] < b.lane[i] ? a.lane[i] : b.lane[i]; }); }
+inline Floats maximum(Floats a, Floats b) {
+    return each([&](int i) { return a.lane[i] > b.lane[i] ? a.lane[i] : b.lane[i]; });
+}
+inline Floats minimum(Floats a, Floats b) {
+    return each([&](int i) { return a.lane[i] < b.lane[i] ? a.lane[i] : b.lane[i]; });
+}
 inline Floats round(Floats a) { return each([&](int i) { return std::nearbyint(a.lane[i]); }); }
 inline float power_of_two(int n) {
     const uint32_t bits = uint32_t(n + 127) << 23;

@@ -84,6 +84,19 @@ def test_a_row_longer_than_any_buffer():
     assert_equals_dense(graph, random_inputs(graph, 1, 4, 16))
 
 
+def test_rows_visited_in_another_order():
+    n = 30_000
+    ring = np.random.default_rng(0).permutation(n)
+    graph = MeshGraph.from_edges(np.stack([ring, np.roll(ring, 1)], 1), n)
+    assert (graph.order != torch.arange(n)).any()
+    inputs = random_inputs(graph, 1, 4, 16)
+    out = mesh_attention(*inputs, graph, backend="native")
+    exact = [tensor.detach().double().requires_grad_() for tensor in inputs]
+    expected = mesh_attention(*exact, graph, backend="reference")
+    for ours, theirs in zip([out, *gradients(out, inputs)], [expected, *gradients(expected, exact)]):
+        assert torch.allclose(ours.double(), theirs, atol=1e-5)
+
+
 def test_isolated_vertices_without_self_loops_get_zeros():
     graph = MeshGraph.from_edges(np.array([[0, 1]]), 4, self_loops=False, global_token=False)
     inputs = random_inputs(graph, 2, 4, 16)

@@ -8,7 +8,7 @@
 
 struct AttentionGraph {
     const int32_t *order, *offsets, *keys, *received_offsets, *received_edges, *received_queries;
-    int64_t vertices, edges, max_degree;
+    int64_t vertices, edges;
     bool global_token;
 
     int64_t tokens() const { return vertices + global_token; }

@@ -51,102 +51,113 @@ struct Rows {
     const float *operator[](int64_t token) const { return data + token * stride; }
 };
 
-// Buffers of one thread, for as many edges as the longest row has, and a vector beyond.
+// Room for the scores of one row, in floats: a whole number of vectors, so that the last one may spill.
+int64_t room(int64_t edges, int64_t width) { return (edges * width + LANES - 1) / LANES * LANES; }
+
+// Where one thread keeps the scores of a chunk's rows.
 struct Scratch {
-    std::vector<float> scores, weights;
-    std::vector<int32_t> tokens;
+    std::vector<float> scores;
+    int64_t starts[CHUNK + 1];
 
     Scratch(const AttentionGraph &graph, int64_t width) {
-        const int64_t edges = std::max<int64_t>(graph.max_degree, CHUNK) + 2;
-        scores.resize(edges * width + LANES);
-        weights.resize(edges * width + LANES);
-        tokens.resize(edges);
+        int64_t size = room(CHUNK, width);
+        for (int64_t first = 0; first < graph.vertices; first += CHUNK)
+            size = std::max(size, place(graph, first, std::min(first + CHUNK, graph.vertices), width));
+        scores.resize(size);
+    }
+
+    // Sets where the scores of each row start; returns where they end.
+    int64_t place(const AttentionGraph &graph, int64_t first, int64_t last, int64_t width) {
+        starts[0] = 0;
+        for (int64_t row = first; row < last; ++row)
+            starts[row - first + 1] = starts[row - first] + room(graph.offsets[row + 1] - graph.offsets[row], width);
+        return starts[std::max<int64_t>(last - first, 0)];
     }
 };
 
-// scores[edge * width + head] = factor * (row . rows[tokens[edge]]) for each head; up to a whole vector is written
-// beyond the end.
-template <int VECTORS, int HEADS>
-void dots(Shape<VECTORS, HEADS> shape, const float *row, Rows rows, const int32_t *tokens, int count, float factor,
-          float *scores) {
+// scores[edge * width + head] = factor * (row . other(edge)) for each head; the last vector is filled up with
+// copies of the last edge's.
+template <int VECTORS, int HEADS, class Other>
+void dots(Shape<VECTORS, HEADS> shape, const float *row, Other other, int count, float factor, float *scores) {
     const int dim = shape.dim();
-    if (HEADS == 0) {
+    if constexpr (HEADS == 0) {
         const int width = shape.width();
-        for (int edge = 0; edge < count; ++edge) {
-            const float *other = rows[tokens[edge]];
+        for (int edge = 0; edge < count; ++edge)
             for (int head = 0; head < width; ++head) {
                 Floats product = zeros();
                 if (head < shape.heads())
                     for (int v = 0; v < shape.vectors(); ++v)
-                        product = fma(shape.get(row + head * dim, v), shape.get(other + head * dim, v), product);
+                        product = fma(shape.get(row + head * dim, v), shape.get(other(edge) + head * dim, v), product);
                 scores[edge * width + head] = factor * sum(product);
             }
-        }
-        return;
-    }
-    const int flat = count * HEADS;
-    for (int first = 0; first < flat; first += LANES) {
-        Floats products[LANES];
+    } else {
+        constexpr int TOGETHER = std::max(LANES / HEADS, 1);  // edges a vector
+        for (int first = 0; first < count; first += TOGETHER)
+            for (int start = 0; start < HEADS; start += LANES) {
+                Floats products[LANES];
 #pragma GCC unroll 16
-        for (int lane = 0; lane < LANES; ++lane) {
-            const int edge = (first + lane) / std::max(HEADS, 1), head = (first + lane) % std::max(HEADS, 1);
-            const float *other = rows[tokens[std::min(edge, count - 1)]] + head * dim, *own = row + head * dim;
-            products[lane] = load(own) * load(other);
+                for (int lane = 0; lane < LANES; ++lane) {
+                    const int offset = (start + lane % HEADS) * dim;
+                    const float *a = row + offset, *b = other(std::min(first + lane / HEADS, count - 1)) + offset;
+                    products[lane] = load(a) * load(b);
 #pragma GCC unroll 4
-            for (int v = 1; v < VECTORS; ++v)
-                products[lane] = fma(load(own + v * LANES), load(other + v * LANES), products[lane]);
-        }
-        store(scores + first, sums(products) * broadcast(factor));
+                    for (int v = 1; v < VECTORS; ++v)
+                        products[lane] = fma(load(a + v * LANES), load(b + v * LANES), products[lane]);
+                }
+                store(scores + first * HEADS + start, sums(products) * broadcast(factor));
+            }
     }
 }
 
-// out = sum over edges of weights[edge * width + head] * rows[tokens[edge]], head by head.
-template <int VECTORS, int HEADS>
-void combine(Shape<VECTORS, HEADS> shape, const float *weights, Rows rows, const int32_t *tokens, int count,
-             float *out) {
-    const int dim = shape.dim(), width = shape.width();
-    if (VECTORS == 0 || HEADS == 0) {
+// out = sum over edges of weight(edge)[head] * other(edge), head by head, and of one more edge where it is given.
+template <int VECTORS, int HEADS, class Weight, class Other>
+void combine(Shape<VECTORS, HEADS> shape, Weight weight, Other other, int count, float *out,
+             const float *more_weight = nullptr, const float *more = nullptr) {
+    if constexpr (VECTORS == 0 || HEADS == 0) {
+        const int dim = shape.dim();
         for (int head = 0; head < shape.heads(); ++head)
             for (int v = 0; v < shape.vectors(); ++v) {
                 Floats total = zeros();
+                if (more) total = broadcast(more_weight[head]) * shape.get(more + head * dim, v);
                 for (int edge = 0; edge < count; ++edge)
-                    total = fma(broadcast(weights[edge * width + head]),
-                                shape.get(rows[tokens[edge]] + head * dim, v), total);
+                    total = fma(broadcast(weight(edge)[head]), shape.get(other(edge) + head * dim, v), total);
                 shape.put(out + head * dim, v, total);
             }
-        return;
-    }
-    constexpr int ALL = VECTORS * HEADS, BLOCK = ALL < 8 ? std::max(ALL, 1) : 8;  // vectors held in registers
-    for (int start = 0; start < ALL; start += BLOCK) {
-        Floats totals[BLOCK];
+    } else {
+        constexpr int ALL = VECTORS * HEADS, BLOCK = std::min(ALL, 8);  // vectors held in registers
+        for (int start = 0; start < ALL; start += BLOCK) {
+            Floats totals[BLOCK];
+            for (Floats &total : totals) total = zeros();
+            const auto add = [&](const float *weights, const float *row) {
 #pragma GCC unroll 8
-        for (int i = 0; i < BLOCK; ++i) totals[i] = zeros();
-        for (int edge = 0; edge < count; ++edge) {
-            const float *other = rows[tokens[edge]] + start * LANES;
-            const float *weight = weights + edge * HEADS;
+                for (int i = 0; i < BLOCK; ++i)
+                    totals[i] = fma(broadcast(weights[(start + i) / VECTORS]), load(row + (start + i) * LANES),
+                                    totals[i]);
+            };
+            if (more) add(more_weight, more);
+            for (int edge = 0; edge < count; ++edge) add(weight(edge), other(edge));
 #pragma GCC unroll 8
-            for (int i = 0; i < BLOCK; ++i)
-                totals[i] = fma(broadcast(weight[(start + i) / std::max(VECTORS, 1)]), load(other + i * LANES), totals[i]);
+            for (int i = 0; i < BLOCK; ++i) store(out + (start + i) * LANES, totals[i]);
         }
-#pragma GCC unroll 8
-        for (int i = 0; i < BLOCK; ++i) store(out + (start + i) * LANES, totals[i]);
     }
 }
 
-// Walks the flat (edge, head) array: columns of LANES lanes, in which equal lanes modulo `period` are one head.
+// The flat (edge, head) array as vectors: equal lanes modulo `period` are one head, and the vectors of the same
+// heads are `step` floats apart.
 template <class Shape>
 struct Flat {
-    int size, period, step;  // floats; heads a vector; distance of vectors of the same heads
+    int size, period, step;
 
     Flat(Shape shape, int count)
         : size(count * shape.width()), period(std::min(shape.width(), LANES)), step(std::max(shape.width(), LANES)) {}
 };
 
-// Turns scores into exponentials of their distance from the largest; writes that and the sum, one a head.
+// Turns scores into exponentials of their distance from the largest. Divides them by their sum, or writes the
+// largest score and the sum, one a head, where these are wanted.
 template <class Shape>
-void exponentials(Shape shape, float *scores, int count, float *largest, float *total) {
+void softmax(Shape shape, float *scores, int count, float *largest = nullptr, float *total = nullptr) {
     const Flat<Shape> flat(shape, count);
-    for (int i = flat.size; i < flat.size + LANES; ++i) scores[i] = -INF;
+    for (int i = flat.size; i % LANES; ++i) scores[i] = -INF;
     for (int column = 0; column < shape.width(); column += LANES) {
         Floats top = broadcast(-INF);
         for (int i = column; i < flat.size; i += flat.step) top = maximum(top, load(scores + i));
@@ -158,20 +169,13 @@ void exponentials(Shape shape, float *scores, int count, float *largest, float *
             sum += e;
         }
         sum = fold_sum(sum, flat.period);
-        store_first(largest + column, top, flat.period);
-        store_first(total + column, sum, flat.period);
-    }
-}
-
-// values[edge, head] *= factors[head].
-template <class Shape>
-void multiply(Shape shape, float *values, int count, const float *factors) {
-    const Flat<Shape> flat(shape, count);
-    for (int column = 0; column < shape.width(); column += LANES) {
-        float lanes[LANES];
-        for (int lane = 0; lane < LANES; ++lane) lanes[lane] = factors[column + lane % flat.period];
-        const Floats factor = load(lanes);
-        for (int i = column; i < flat.size; i += flat.step) store(values + i, load(values + i) * factor);
+        if (largest) {
+            store_first(largest + column, top, flat.period);
+            store_first(total + column, sum, flat.period);
+            continue;
+        }
+        const Floats factor = broadcast(1.0f) / sum;
+        for (int i = column; i < flat.size; i += flat.step) store(scores + i, load(scores + i) * factor);
     }
 }
 
@@ -179,8 +183,12 @@ void multiply(Shape shape, float *values, int count, const float *factors) {
 // sum of probabilities * gradients over the row's edges, or is given.
 template <class Shape>
 void softmax_backward(Shape shape, const float *probabilities, float *gradients, int count, float factor,
-                      const float *given_delta) {
+                      const float *given_delta = nullptr) {
     const Flat<Shape> flat(shape, count);
+    for (int i = flat.size; i % LANES; ++i) gradients[i] = 0;
+    const auto probability = [&](int i) {
+        return i + LANES <= flat.size ? load(probabilities + i) : load_first(probabilities + i, flat.size - i);
+    };
     for (int column = 0; column < shape.width(); column += LANES) {
         Floats delta = zeros();
         if (given_delta) {
@@ -188,26 +196,27 @@ void softmax_backward(Shape shape, const float *probabilities, float *gradients,
             for (int lane = 0; lane < LANES; ++lane) lanes[lane] = given_delta[column + lane % flat.period];
             delta = load(lanes);
         } else {
-            for (int i = column; i < flat.size; i += flat.step) {
-                const int n = std::min(LANES, flat.size - i);
-                const Floats p = load_first(probabilities + i, n);
-                // Lanes beyond the row hold repeats, infinities perhaps; they must not reach the sum.
-                delta = fma(p, load_first(gradients + i, n), delta);
-            }
+            for (int i = column; i < flat.size; i += flat.step)
+                delta = fma(probability(i), load(gradients + i), delta);
             delta = fold_sum(delta, flat.period);
         }
-        for (int i = column; i < flat.size; i += flat.step) {
-            const Floats p = load_first(probabilities + i, std::min(LANES, flat.size - i));
-            store(gradients + i, broadcast(factor) * p * (load(gradients + i) - delta));
-        }
+        for (int i = column; i < flat.size; i += flat.step)
+            store(gradients + i, broadcast(factor) * probability(i) * (load(gradients + i) - delta));
     }
 }
 
-// The tokens of rows first..last: vertices in visiting order, and the global token as the last row.
-const int32_t *chunk_tokens(const AttentionGraph &graph, int64_t first, int64_t last, Scratch &scratch) {
-    for (int64_t row = first; row < last; ++row)
-        scratch.tokens[row - first] = row < graph.vertices ? graph.order[row] : int32_t(graph.vertices);
-    return scratch.tokens.data();
+// The token of a row: a vertex in visiting order, or behind them the global token.
+int64_t token_of(const AttentionGraph &graph, int64_t row) { return row < graph.vertices ? graph.order[row] : row; }
+
+// Calls step(token, first edge, number of edges, scores) for each vertex's row of a chunk. Work goes step by step
+// over all rows of a chunk, since the steps of different rows overlap in the processor and those of one do not.
+template <class Step>
+void each_row(const AttentionGraph &graph, int64_t first, int64_t last, Scratch &scratch, Step step) {
+    for (int64_t row = first; row < std::min(last, graph.vertices); ++row) {
+        const int64_t edge = graph.offsets[row];
+        step(graph.order[row], edge, int(graph.offsets[row + 1] - edge),
+             scratch.scores.data() + scratch.starts[row - first]);
+    }
 }
 
 // What one chunk contributes to a row that sees all: the largest score, the sum of exponentials, the weighted sum.
@@ -255,26 +264,30 @@ void forward_chunk(Shape shape, const AttentionForward &a, int64_t batch, int64_
     const int width = shape.width();
     float *kept = a.probabilities ? a.probabilities + batch * graph.all_edges() * width : nullptr;
     const int64_t first = chunk * CHUNK, last = std::min(first + CHUNK, graph.tokens());
-    float *scores = scratch.scores.data(), *factors = scratch.weights.data();
-    for (int64_t row = first; row < std::min(last, graph.vertices); ++row) {
-        const int64_t token = graph.order[row], edge = graph.offsets[row];
-        const int count = int(graph.offsets[row + 1] - edge);
-        const int32_t *seen = graph.keys + edge;
-        dots(shape, a.query.row(batch, token), keys, seen, count, a.scale, scores);
-        exponentials(shape, scores, count, factors, factors + width);
-        for (int head = 0; head < width; ++head) factors[head] = 1.0f / factors[width + head];
-        multiply(shape, scores, count, factors);
+    scratch.place(graph, first, std::min(last, graph.vertices), width);
+    each_row(graph, first, last, scratch, [&](int64_t token, int64_t edge, int count, float *scores) {
+        const auto key = [&](int i) { return keys[graph.keys[edge + i]]; };
+        dots(shape, a.query.row(batch, token), key, count, a.scale, scores);
+    });
+    each_row(graph, first, last, scratch,
+             [&](int64_t, int64_t, int count, float *scores) { softmax(shape, scores, count); });
+    each_row(graph, first, last, scratch, [&](int64_t token, int64_t edge, int count, float *scores) {
         if (kept) std::memcpy(kept + edge * width, scores, count * width * sizeof(float));
-        combine(shape, scores, values, seen, count, a.out.row(batch, token));
-    }
+        const auto weight = [&](int i) { return scores + i * width; };
+        const auto value = [&](int i) { return values[graph.keys[edge + i]]; };
+        combine(shape, weight, value, count, a.out.row(batch, token));
+    });
     if (!graph.global_token) return;
+    float *scores = scratch.scores.data();
     const int count = int(last - first);
     const int64_t index = batch * chunks(graph.tokens()) + chunk;
-    const int32_t *seen = chunk_tokens(graph, first, last, scratch);
-    dots(shape, a.query.row(batch, graph.vertices), keys, seen, count, a.scale, scores);
+    const auto key = [&](int i) { return keys[token_of(graph, first + i)]; };
+    const auto value = [&](int i) { return values[token_of(graph, first + i)]; };
+    const auto weight = [&](int i) { return scores + i * width; };
+    dots(shape, a.query.row(batch, graph.vertices), key, count, a.scale, scores);
     if (kept) std::memcpy(kept + (graph.edges + first) * width, scores, count * width * sizeof(float));
-    exponentials(shape, scores, count, partials.largest(index), partials.total(index));
-    combine(shape, scores, values, seen, count, partials.sum(index));
+    softmax(shape, scores, count, partials.largest(index), partials.total(index));
+    combine(shape, weight, value, count, partials.sum(index));
 }
 
 template <class Shape>
@@ -321,53 +334,60 @@ void backward_queries(Shape shape, const AttentionBackward &a, int64_t batch, in
     const AttentionGraph &graph = a.graph;
     const Rows keys(a.key, batch), values(a.value, batch);
     const int width = shape.width();
-    const int64_t start = batch * graph.all_edges();
+    const int64_t start = batch * graph.all_edges() * width;
+    const float *probabilities = a.probabilities + start;
+    float *kept = a.score_gradients + start;
     const int64_t first = chunk * CHUNK, last = std::min(first + CHUNK, graph.tokens());
-    float *gradients = scratch.scores.data();
-    for (int64_t row = first; row < std::min(last, graph.vertices); ++row) {
-        const int64_t token = graph.order[row], edge = graph.offsets[row];
-        const int count = int(graph.offsets[row + 1] - edge);
-        const int32_t *seen = graph.keys + edge;
-        dots(shape, a.grad_out.row(batch, token), values, seen, count, 1.0f, gradients);
-        softmax_backward(shape, a.probabilities + (start + edge) * width, gradients, count, a.scale, nullptr);
-        std::memcpy(a.score_gradients + (start + edge) * width, gradients, count * width * sizeof(float));
-        combine(shape, gradients, keys, seen, count, a.grad_query.row(batch, token));
-    }
+    scratch.place(graph, first, std::min(last, graph.vertices), width);
+    each_row(graph, first, last, scratch, [&](int64_t token, int64_t edge, int count, float *gradients) {
+        const auto value = [&](int i) { return values[graph.keys[edge + i]]; };
+        dots(shape, a.grad_out.row(batch, token), value, count, 1.0f, gradients);
+    });
+    each_row(graph, first, last, scratch, [&](int64_t, int64_t edge, int count, float *gradients) {
+        softmax_backward(shape, probabilities + edge * width, gradients, count, a.scale);
+    });
+    each_row(graph, first, last, scratch, [&](int64_t token, int64_t edge, int count, float *gradients) {
+        std::memcpy(kept + edge * width, gradients, count * width * sizeof(float));
+        const auto weight = [&](int i) { return gradients + i * width; };
+        const auto key = [&](int i) { return keys[graph.keys[edge + i]]; };
+        combine(shape, weight, key, count, a.grad_query.row(batch, token));
+    });
     if (!graph.global_token) return;
+    float *gradients = scratch.scores.data();
     const int count = int(last - first);
-    const int64_t edge = start + graph.edges + first;
-    const int32_t *seen = chunk_tokens(graph, first, last, scratch);
-    dots(shape, a.grad_out.row(batch, graph.vertices), values, seen, count, 1.0f, gradients);
-    softmax_backward(shape, a.probabilities + edge * width, gradients, count, a.scale, delta);
-    std::memcpy(a.score_gradients + edge * width, gradients, count * width * sizeof(float));
-    combine(shape, gradients, keys, seen, count, partials.sum(batch * chunks(graph.tokens()) + chunk));
+    const int64_t edge = graph.edges + first;
+    const auto key = [&](int i) { return keys[token_of(graph, first + i)]; };
+    const auto value = [&](int i) { return values[token_of(graph, first + i)]; };
+    const auto weight = [&](int i) { return gradients + i * width; };
+    dots(shape, a.grad_out.row(batch, graph.vertices), value, count, 1.0f, gradients);
+    softmax_backward(shape, probabilities + edge * width, gradients, count, a.scale, delta);
+    std::memcpy(kept + edge * width, gradients, count * width * sizeof(float));
+    combine(shape, weight, key, count, partials.sum(batch * chunks(graph.tokens()) + chunk));
 }
 
 // Gradients of keys and values, gathered by key over the transposed graph.
 template <class Shape>
-void backward_keys(Shape shape, const AttentionBackward &a, int64_t batch, int64_t chunk, Scratch &scratch) {
+void backward_keys(Shape shape, const AttentionBackward &a, int64_t batch, int64_t chunk) {
     const AttentionGraph &graph = a.graph;
     const Rows queries(a.query, batch), grad_outs(a.grad_out, batch);
     const int width = shape.width();
-    const int64_t start = batch * graph.all_edges();
+    const int64_t start = batch * graph.all_edges() * width;
+    const float *probabilities = a.probabilities + start, *gradients = a.score_gradients + start;
+    const float *global_query = graph.global_token ? queries[graph.vertices] : nullptr;
+    const float *global_grad = graph.global_token ? grad_outs[graph.vertices] : nullptr;
     const int64_t first = chunk * CHUNK, last = std::min(first + CHUNK, graph.tokens());
-    int32_t *seen = scratch.tokens.data();
-    float *gradients = scratch.scores.data(), *probabilities = scratch.weights.data();
     for (int64_t row = first; row < last; ++row) {
-        int count = 0;
-        const auto take = [&](int64_t edge, int64_t query) {
-            seen[count] = int32_t(query);
-            std::memcpy(gradients + count * width, a.score_gradients + (start + edge) * width, width * sizeof(float));
-            std::memcpy(probabilities + count * width, a.probabilities + (start + edge) * width, width * sizeof(float));
-            ++count;
-        };
-        if (row < graph.vertices)
-            for (int64_t i = graph.received_offsets[row]; i < graph.received_offsets[row + 1]; ++i)
-                take(graph.received_edges[i], graph.received_queries[i]);
-        if (graph.global_token) take(graph.edges + row, graph.vertices);
-        const int64_t token = row < graph.vertices ? graph.order[row] : graph.vertices;
-        combine(shape, gradients, queries, seen, count, a.grad_key.row(batch, token));
-        combine(shape, probabilities, grad_outs, seen, count, a.grad_value.row(batch, token));
+        const bool vertex = row < graph.vertices;
+        const int64_t from = vertex ? graph.received_offsets[row] : 0, token = token_of(graph, row);
+        const int count = vertex ? int(graph.received_offsets[row + 1] - from) : 0;
+        const int32_t *edges = graph.received_edges + from, *tokens = graph.received_queries + from;
+        const int64_t global = (graph.edges + row) * width;
+        combine(shape, [&](int i) { return gradients + int64_t(edges[i]) * width; },
+                [&](int i) { return queries[tokens[i]]; }, count, a.grad_key.row(batch, token), gradients + global,
+                global_query);
+        combine(shape, [&](int i) { return probabilities + int64_t(edges[i]) * width; },
+                [&](int i) { return grad_outs[tokens[i]]; }, count, a.grad_value.row(batch, token),
+                probabilities + global, global_grad);
     }
 }
 
@@ -390,13 +410,18 @@ void backward(const AttentionBackward &a) {
 #pragma omp parallel num_threads(a.threads)
     {
         Scratch scratch(graph, a.width);
-#pragma omp for schedule(dynamic, 4)
-        for (int64_t item = 0; item < items; ++item)
-            backward_queries(shape, a, item / per_batch, item % per_batch, &delta[item / per_batch * a.width], scratch,
-                             partials);
-#pragma omp for schedule(dynamic, 4)
-        for (int64_t item = 0; item < items; ++item)
-            backward_keys(shape, a, item / per_batch, item % per_batch, scratch);
+        // Both passes over as many batch elements as there are threads, so that the second finds in the cache what
+        // the first has read and written.
+        for (int64_t batch = 0; batch < a.batch; batch += a.threads) {
+            const int64_t end = std::min<int64_t>(batch + a.threads, a.batch) * per_batch;
+#pragma omp for schedule(dynamic, 8)
+            for (int64_t item = batch * per_batch; item < end; ++item)
+                backward_queries(shape, a, item / per_batch, item % per_batch, &delta[item / per_batch * a.width],
+                                 scratch, partials);
+#pragma omp for schedule(dynamic, 8)
+            for (int64_t item = batch * per_batch; item < end; ++item)
+                backward_keys(shape, a, item / per_batch, item % per_batch);
+        }
         if (global) {
 #pragma omp for schedule(static)
             for (int64_t batch = 0; batch < a.batch; ++batch) {

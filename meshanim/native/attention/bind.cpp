@@ -2,7 +2,6 @@
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 
-#include <algorithm>
 #include <stdexcept>
 
 #include "../isa.h"
@@ -35,10 +34,6 @@ AttentionGraph graph_of(Indices order, Indices offsets, Indices keys, Indices re
     require(offsets.size() == order.size() + 1 && received_offsets.size() == order.size() + 1 &&
                 received_edges.size() == keys.size() && received_queries.size() == keys.size(),
             "mesh attention: the graph's arrays do not fit together");
-    graph.max_degree = 0;
-    for (int64_t row = 0; row < graph.vertices; ++row)
-        graph.max_degree = std::max<int64_t>({graph.max_degree, graph.offsets[row + 1] - graph.offsets[row],
-                                              graph.received_offsets[row + 1] - graph.received_offsets[row]});
     return graph;
 }
 
