@@ -59,8 +59,9 @@ def mesh_attention(
     graph : MeshGraph
         On the same device.
     backend : str
-        "native" (C++, CPU, float32), "cuda" (Triton, float32), "reference" (torch, any device and type) or
-        "auto": the fast one of the device where it is built, the reference otherwise and for float64.
+        "native" (C++, CPU, float32), "reference" (torch, gathering a row an edge: any device and type), "cuda"
+        (the gathering form, only on an NVIDIA GPU) or "auto": native where it is built and applies, the
+        reference otherwise and for float64.
     scale : float, optional
         1 / sqrt(D) if not given.
 
@@ -118,6 +119,10 @@ def _choose(backend: str, query: Tensor) -> str:
                 f"backend 'native' computes float32 on the CPU, not {query.dtype} on {query.device}: "
                 "use backend='reference'"
             )
+    if backend == "cuda" and query.device.type != "cuda":
+        raise BackendError(
+            f"backend 'cuda' needs tensors on an NVIDIA GPU, not on {query.device}: use 'auto'"
+        )
     return backend
 
 

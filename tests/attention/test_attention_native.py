@@ -277,9 +277,25 @@ def test_backends_are_chosen_and_refused(monkeypatch):
         mesh_attention(*inputs, graph, backend="native")
     exact = mesh_attention(*inputs, graph)
     assert torch.equal(exact, mesh_attention(*inputs, graph, backend="reference"))
+    with pytest.raises(BackendError, match="NVIDIA"):
+        mesh_attention(*inputs, graph, backend="cuda")
     narrow = [tensor.detach().float() for tensor in inputs]
     assert torch.equal(mesh_attention(*narrow, graph), mesh_attention(*narrow, graph, backend="native"))
     monkeypatch.setattr(native_module, "_native", None)
     assert torch.equal(mesh_attention(*narrow, graph), mesh_attention(*narrow, graph, backend="reference"))
     with pytest.raises(BackendError, match=r"not built.*reference"):
         mesh_attention(*narrow, graph, backend="native")
+
+
+@pytest.mark.cuda
+def test_cuda_equals_dense_attention():
+    graph = MeshGraph.from_faces(sphere(2)[1]).to("cuda")
+    inputs = [tensor.detach().cuda().requires_grad_() for tensor in random_inputs(graph, 2, 4, 16)]
+    exact = [tensor.detach().double().requires_grad_() for tensor in inputs]
+    out = mesh_attention(*inputs, graph, backend="cuda")
+    expected = dense_attention(*exact, graph)
+    assert torch.allclose(out.double(), expected, atol=1e-5)
+    for ours, theirs in zip(
+        torch.autograd.grad(out.square().sum(), inputs), torch.autograd.grad(expected.square().sum(), exact)
+    ):
+        assert torch.allclose(ours.double(), theirs, atol=1e-4)
