@@ -59,7 +59,7 @@ def mesh_attention(
     graph : MeshGraph
         On the same device.
     backend : str
-        "native" (C++, CPU, float32), "reference" (torch, gathering a row an edge: any device and type), "cuda"
+        "native" (C++, CPU, float32), "reference" (torch, a row an edge: any device and type), "cuda"
         (the gathering form, only on an NVIDIA GPU) or "auto": native where it is built and applies, the
         reference otherwise and for float64.
     scale : float, optional

@@ -14,7 +14,7 @@ from meshanim.errors import MeshError, OptionError, ShapeError
 __all__ = ["MeshGraph", "locality_order"]
 
 # Rows further apart than this seldom share a cache. Reading in sequence outweighs a better order of visits
-# until most neighbours are that far: at 100,000 vertices in random numbering the better order wins by a third;
+# until most neighbours are that far: at 100,000 vertices in random numbering it wins by a third;
 # in the numbering that decimation leaves there, and on meshes that fit a cache, it loses.
 FAR = 4096
 

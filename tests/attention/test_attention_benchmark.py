@@ -1,0 +1,22 @@
+import numpy as np
+import pytest
+
+from meshanim.attention.benchmark import BenchmarkOptions, closed_mesh_faces, run
+from meshanim.geometry import TriangleMesh
+
+
+def test_mesh_is_closed_and_of_the_size_asked_for():
+    faces = closed_mesh_faces(503)
+    edges = TriangleMesh(np.zeros((503, 3)), faces).edges
+    assert np.unique(faces).size == 503
+    assert 503 - len(edges) + len(faces) == 2
+
+
+def test_rows_and_ratios():
+    pytest.importorskip("meshanim._native", reason="the extension was not built")
+    results = run(BenchmarkOptions(vertices=162, batch=1, repeats=1, scaling=(100,), memory_vertices=0))
+    case = "162 vertices"
+    ratio = results.value(case, "dense / native", "forward ratio")
+    times = [results.value(case, name, "forward") for name in ("dense", "native")]
+    assert ratio == pytest.approx(times[0] / times[1])
+    assert results.value("100 vertices", "native", "forward + backward a vertex") > 0
