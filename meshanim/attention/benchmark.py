@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
-import trimesh
+from scipy.spatial import ConvexHull
 from torch import Tensor
 
 from meshanim.attention.functional import mesh_attention
@@ -62,7 +62,7 @@ def closed_mesh_faces(vertices: int) -> np.ndarray:
     height = 1 - 2 * (np.arange(vertices) + 0.5) / vertices
     radius = np.sqrt(1 - height**2)
     points = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], 1)
-    return np.asarray(trimesh.convex.convex_hull(points, repair=False).faces, np.int64)
+    return ConvexHull(points).simplices.astype(np.int64)
 
 
 def _compare(options: BenchmarkOptions, results: Results) -> None:
