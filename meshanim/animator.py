@@ -17,7 +17,8 @@ from meshanim.audio.encoders import MelEncoder
 from meshanim.audio.features import frame_count
 from meshanim.errors import FileFormatError, OptionError
 from meshanim.geometry import TriangleMesh
-from meshanim.heads import Head, load_head
+from meshanim.geometry.correspondence import surface_correspondence
+from meshanim.heads import DefaultHead, Head, load_head
 from meshanim.models.gava import Gava
 from meshanim.models.gava_stream import GavaStream
 from meshanim.motion import MeshSequence
@@ -182,7 +183,9 @@ class Animator:
         self.mel = MelEncoder()
         self.model_head = model_head
         self.head = model_head if head is None else head
-        self.retarget = None
+        self.correspondence = None
+        if head is not None and not _same_faces(head.mesh, model.mesh):
+            self.correspondence = surface_correspondence(model.mesh, head.mesh)
 
     @classmethod
     def from_pretrained(
@@ -232,11 +235,11 @@ class Animator:
 
     def lip_seal(self) -> LipSeal | None:
         """The seal of the network's head; None where the head names no lip pairs or the encoder no class."""
-        pairs = getattr(self.model_head, "lip_pairs", None)
-        if pairs is None or self.bilabial is None:
+        head = self.model_head
+        if not isinstance(head, DefaultHead) or self.bilabial is None:
             return None
-        closing = self.model_head.expression_directions[self.model_head.expression_names.index("mouthClose")]
-        return LipSeal(torch.as_tensor(np.asarray(pairs)), closing.reshape(-1, 3))
+        closing = head.expression_directions[head.expression_names.index("mouthClose")]
+        return LipSeal(torch.from_numpy(head.lip_pairs), closing.reshape(-1, 3))
 
     def open(
         self, rate: int = 16000, options: AnimationOptions | None = None, template: Template | None = None
@@ -304,7 +307,7 @@ class Animator:
         vertices = np.concatenate([part.vertices for part in parts])
         pose = np.concatenate([part.pose for part in parts])
         mesh = self.mesh
-        if template is not None and self.retarget is None:
+        if template is not None and self.correspondence is None:
             mesh = mesh.with_vertices(template)
         return MeshSequence(vertices, stream.fps, mesh, pose, waveform)
 
@@ -316,4 +319,10 @@ class Animator:
             amounts = torch.from_numpy(np.stack(list(weights.values()), 1).astype(np.float32))
             moved = (amounts @ head.expression_directions[rows]).reshape(len(vertices), -1, 3)
             vertices = vertices + moved.numpy()
-        return vertices if self.retarget is None else self.retarget(vertices)
+        if self.correspondence is None:
+            return vertices
+        return self.correspondence.carry_displacements(vertices).astype(np.float32)
+
+
+def _same_faces(one: TriangleMesh, other: TriangleMesh) -> bool:
+    return one.n_vertices == other.n_vertices and np.array_equal(one.faces, other.faces)

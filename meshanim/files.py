@@ -8,7 +8,7 @@ from pathlib import Path
 
 from meshanim.errors import FileFormatError
 
-__all__ = ["written_whole"]
+__all__ = ["check_writable", "written_whole"]
 
 
 @contextmanager
@@ -27,14 +27,7 @@ def written_whole(path: str | Path) -> Iterator[Path]:
         If the folder does not exist or cannot be written to.
     """
     path = Path(path)
-    if path.is_dir():
-        raise FileFormatError(f"cannot write {path}: it is a folder")
-    try:
-        handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
-    except OSError as error:
-        raise FileFormatError(f"cannot write {path}: {error.strerror}") from error
-    os.close(handle)
-    temporary = Path(name)
+    temporary = _temporary_beside(path)
     try:
         yield temporary
         mask = os.umask(0)
@@ -43,3 +36,25 @@ def written_whole(path: str | Path) -> Iterator[Path]:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def check_writable(path: str | Path) -> None:
+    """Find out before long work whether `path` can be written.
+
+    Raises
+    ------
+    FileFormatError
+        If the folder does not exist or cannot be written to, or `path` is a folder.
+    """
+    _temporary_beside(Path(path)).unlink()
+
+
+def _temporary_beside(path: Path) -> Path:
+    if path.is_dir():
+        raise FileFormatError(f"cannot write {path}: it is a folder")
+    try:
+        handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
+    except OSError as error:
+        raise FileFormatError(f"cannot write {path}: {error.strerror}") from error
+    os.close(handle)
+    return Path(name)

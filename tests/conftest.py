@@ -1,8 +1,11 @@
 """Shapes are checked while tests run: jaxtyping and beartype on the sources of the checkout."""
 
+import os
 from pathlib import Path
 
 from jaxtyping import install_import_hook
+
+os.environ["HF_HUB_OFFLINE"] = "1"  # no test talks to the network
 
 install_import_hook("meshanim", "shape_checks.check")
 

@@ -14,6 +14,8 @@ __all__ = ["main"]
 # A verb's module has COMMANDS: its command, or a mapping from the second word to one. A command is a function
 # of one frozen dataclass, whose docstring and field comments are the help.
 VERBS = {
+    "animate": "speech in; a video, glTF, npz or contact sheet of a talking head out",
+    "demo": "the same on a recorded sentence that ships with the package",
     "data": "data sets: synthesize, check",
     "doctor": "what is installed, which backends work, how to get what is missing",
 }
@@ -80,7 +82,7 @@ def _run(words: list[str]) -> int:
 
 def _call(command: Command, words: list[str], prog: str) -> int:
     try:
-        options = tyro.cli(_options_of(command), args=words, prog=prog)
+        options: object = tyro.cli(_options_of(command), args=words, prog=prog)
     except SystemExit as stop:  # --help, or words that do not parse; tyro has said which
         return stop.code if isinstance(stop.code, int) else 2
     code = command(options)

@@ -265,7 +265,7 @@ def _material(buffer, material: GltfMaterial) -> dict:
     }
     if material.texture is not None:
         surface["baseColorTexture"] = {"index": buffer.texture(material.texture)}
-    return {"name": material.name, "pbrMetallicRoughness": surface}
+    return {"name": material.name, "pbrMetallicRoughness": surface, "doubleSided": True}
 
 
 class _Buffer:

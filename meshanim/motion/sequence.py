@@ -39,7 +39,7 @@ class MeshSequence:
     vertices: Float[np.ndarray, "frames vertices 3"]
     fps: float
     mesh: TriangleMesh
-    pose: Float[np.ndarray, "frames 3"] | None = None
+    pose: Float[np.ndarray, "frames 3"] = None  # type: ignore[assignment]  # set below
     audio: Waveform | None = None
 
     def __post_init__(self):

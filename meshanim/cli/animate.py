@@ -1,0 +1,146 @@
+"""`meshanim animate`: speech in; a video, glTF, npz or contact sheet of a talking head out."""
+
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import torch
+from tqdm import tqdm
+from tyro.conf import OmitArgPrefixes, Positional, arg
+
+from meshanim.animator import AnimationOptions, Animator
+from meshanim.errors import OptionError
+from meshanim.files import check_writable
+from meshanim.heads import DefaultHead
+from meshanim.motion import MeshSequence
+
+__all__ = ["COMMANDS", "AnimateOptions", "animate"]
+
+ENDINGS = (".mp4", ".glb", ".npz", ".png")
+
+
+@dataclass(frozen=True)
+class AnimateOptions:
+    """Speech in; a video, glTF, npz or contact sheet of a talking head out.
+
+    Example: meshanim animate speech.wav -o talk.mp4
+    """
+
+    speech: Positional[Path]
+    """Sound file: wav, flac, ogg, mp3 and whatever else libsndfile reads."""
+    output: Annotated[Path, arg(aliases=["-o"])] = Path("talk.mp4")
+    """The ending chooses: mp4 (with sound), glb (any glTF viewer), npz (vertices, pose, fps), png (contact
+    sheet)."""
+    model: str = "default"
+    """Checkpoint: default, a folder that `meshanim train` wrote, or a repository of the hub."""
+    head: str = "default"
+    """Head to animate: default, flame:/path/generic_model.pkl or rig:/path/face.glb."""
+    person: str = "ana"
+    """Who, on the default head: one of the twelve people that `docs/look.md` shows."""
+    skin: Path | None = None
+    """Picture in MakeHuman's layout that replaces the painted skin."""
+    quality: Literal["full", "draft"] = "full"
+    """Of pictures: full has hair, subsurface scattering and anti-aliasing; draft is faster than real time."""
+    size: int = 512
+    """Pixels along the side of a video frame, even."""
+    performance: OmitArgPrefixes[AnimationOptions] = field(default_factory=AnimationOptions)
+
+
+def animate(options: AnimateOptions) -> None:
+    """Run the verb."""
+    ending = options.output.suffix.lower()
+    if ending not in ENDINGS:
+        raise OptionError(f"cannot write {options.output}: the ending must be one of {', '.join(ENDINGS)}")
+    if options.size < 16 or options.size % 2:
+        raise OptionError(f"size must be even and at least 16, not {options.size}")
+    check_writable(options.output)
+    animator = Animator.from_pretrained(options.model, options.head)
+    scene = _Scene(animator, options)
+    sequence = animator(options.speech, options.performance, scene.template)
+    if ending == ".npz":
+        sequence.save(options.output)
+    elif ending == ".glb":
+        scene.write_glb(sequence)
+    elif ending == ".png":
+        scene.write_sheet(sequence)
+    else:
+        scene.write_video(sequence)
+    print(
+        f"wrote {options.output}: {len(sequence)} frames, {sequence.duration:.2f} s at {sequence.fps:g} fps"
+    )
+
+
+class _Scene:
+    """What is drawn: a person on the default head, or clay on any other."""
+
+    def __init__(self, animator: Animator, options: AnimateOptions):
+        self.animator, self.options = animator, options
+        self.appearance = None
+        if isinstance(animator.head, DefaultHead):
+            from meshanim.render.look import find_person, make_appearance
+
+            self.appearance = make_appearance(animator.head, find_person(options.person))
+        elif options.skin is not None:
+            raise OptionError("--skin paints the default head only")
+
+    @property
+    def template(self) -> np.ndarray | None:
+        return None if self.appearance is None else self.appearance.template
+
+    def _shape(self) -> torch.Tensor | None:
+        return None if self.appearance is None else torch.from_numpy(self.appearance.shape)[None]
+
+    def frames(self, sequence: MeshSequence, size: int) -> Iterator[np.ndarray]:
+        from meshanim.render import portrait_camera, render_mesh, render_sequence
+
+        head, quality = self.animator.head, self.options.quality
+        if self.appearance is not None and isinstance(head, DefaultHead):
+            yield from render_sequence(sequence, head, self.appearance, size, size, quality)
+            return
+        camera = portrait_camera(sequence.mesh.vertices, size, size)
+        for vertices in sequence.vertices if head is None else sequence.posed(head):
+            yield render_mesh(vertices, sequence.mesh, camera, quality=quality)
+
+    def write_video(self, sequence: MeshSequence) -> None:
+        from meshanim.export import write_video
+
+        frames = tqdm(
+            self.frames(sequence, self.options.size),
+            total=len(sequence),
+            desc="render",
+            unit="frame",
+            disable=not sys.stderr.isatty(),
+        )
+        write_video(self.options.output, iter(frames), sequence.fps, sequence.audio)
+
+    def write_sheet(self, sequence: MeshSequence, most: int = 24) -> None:
+        from meshanim.export import contact_sheet, write_png
+
+        chosen = np.unique(np.linspace(0, len(sequence) - 1, min(most, len(sequence))).round().astype(int))
+        part = MeshSequence(
+            sequence.vertices[chosen], sequence.fps, sequence.mesh, sequence.pose[chosen], sequence.audio
+        )
+        frames = list(self.frames(part, self.options.size // 2))
+        labels = [f"{(index + 0.5) / sequence.fps:.2f} s" for index in chosen]
+        write_png(self.options.output, contact_sheet(frames, columns=6, labels=labels))
+
+    def write_glb(self, sequence: MeshSequence) -> None:
+        from meshanim.export import write_glb
+        from meshanim.export.materials import gltf_materials
+
+        head = self.animator.head
+        if head is None:
+            write_glb(self.options.output, sequence)
+            return
+        pivot = head.joints(self._shape())[0, 1].numpy()
+        follow = head.weights[:, 1:].sum(1).numpy()
+        materials = None
+        if self.appearance is not None and isinstance(head, DefaultHead):
+            materials = gltf_materials(head, self.appearance)
+        write_glb(self.options.output, sequence, materials, pivot, follow)
+
+
+COMMANDS = animate

@@ -1,0 +1,37 @@
+"""`meshanim bench`: measurements that anyone can repeat."""
+
+from importlib.resources import as_file, files
+from pathlib import Path
+
+from meshanim.animation_benchmark import AnimationBenchmark
+from meshanim.attention.benchmark import BenchmarkOptions
+from meshanim.cli.demo import CLIP
+from meshanim.results import Results
+
+__all__ = ["COMMANDS"]
+
+
+def _attention(options: BenchmarkOptions) -> None:
+    from meshanim.attention import benchmark
+
+    _report(benchmark.run(options), options.json)
+
+
+def _animate(options: AnimationBenchmark) -> None:
+    from meshanim import animation_benchmark
+    from meshanim.render import benchmark
+
+    with as_file(files("meshanim").joinpath(CLIP)) as clip:
+        results = animation_benchmark.run(options, clip)
+    results.rows.extend(benchmark.run(options.frames, options.size).rows)
+    _report(results, options.json)
+
+
+def _report(results: Results, path: Path | None) -> None:
+    print(results.table())
+    print(", ".join(f"{key} {value}" for key, value in results.machine.items()))
+    if path is not None:
+        results.save(path)
+
+
+COMMANDS = {"attention": _attention, "animate": _animate}

@@ -1,0 +1,102 @@
+"""The main command, run as a user runs it, on every output format and on bad input."""
+
+import av
+import numpy as np
+import pytest
+import soundfile
+import trimesh
+from PIL import Image
+
+from meshanim.cli import main
+from meshanim.motion import MeshSequence
+
+
+@pytest.fixture(scope="module")
+def speech(tmp_path_factory):
+    """A third of a second of something voiced."""
+    path = tmp_path_factory.mktemp("speech") / "ba.wav"
+    time = np.arange(5333) / 16000
+    buzz = sum(np.sin(2 * np.pi * 120 * k * time) / k for k in range(1, 20))
+    soundfile.write(path, 0.1 * buzz * np.sin(np.pi * time / time[-1]), 16000)
+    return path
+
+
+def run(*words) -> int:
+    return main([str(word) for word in words])
+
+
+def test_video_with_sound(speech, tmp_path):
+    out = tmp_path / "talk.mp4"
+    assert run("animate", speech, "-o", out, "--quality", "draft", "--size", 64) == 0
+    with av.open(str(out)) as file:
+        assert len(list(file.decode(video=0))) == 10
+        assert (file.streams.video[0].width, file.streams.video[0].height) == (64, 64)
+        assert float(file.streams.audio[0].duration * file.streams.audio[0].time_base) == pytest.approx(
+            1 / 3, abs=0.07
+        )
+
+
+def test_npz_glb_and_sheet(speech, tmp_path):
+    assert run("animate", speech, "-o", tmp_path / "talk.npz", "--seed", 3) == 0
+    sequence = MeshSequence.load(tmp_path / "talk.npz")
+    assert len(sequence) == 10
+    assert sequence.fps == 30
+    assert np.isfinite(sequence.vertices).all()
+    assert run("animate", speech, "-o", tmp_path / "talk.glb") == 0
+    assert len(trimesh.load(tmp_path / "talk.glb").geometry) == 5
+    assert run("animate", speech, "-o", tmp_path / "talk.png", "--size", 64, "--quality", "draft") == 0
+    assert Image.open(tmp_path / "talk.png").size == (6 * 32, 2 * 32)
+
+
+BAD = {
+    "text named wav": lambda folder: (folder / "a.wav").write_text("hello"),
+    "missing": lambda folder: None,
+    "empty": lambda folder: soundfile.write(folder / "a.wav", np.zeros(0), 16000),
+    "NaN": lambda folder: soundfile.write(
+        folder / "a.wav", np.full(99, np.nan, np.float32), 16000, subtype="FLOAT"
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_sound_is_one_line_exit_2_and_no_file(name, tmp_path, capsys):
+    BAD[name](tmp_path)
+    out = tmp_path / "talk.npz"
+    assert run("animate", tmp_path / "a.wav", "-o", out) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("meshanim: ")
+    assert error.count("\n") == 1
+    assert "a.wav" in error
+    assert [path.name for path in tmp_path.iterdir()] in (["a.wav"], [])
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (("-o", "talk.avi"), ".mp4"),
+        (("-o", "nowhere/talk.mp4"), "nowhere"),
+        (("-o", "talk.mp4", "--size", "33"), "even"),
+        (("-o", "talk.npz", "--person", "nobody"), "nobody"),
+        (("-o", "talk.npz", "--subject", "nobody"), "nobody"),
+        (("-o", "talk.npz", "--fps", "0"), "fps"),
+        (("-o", "talk.npz", "--head", "flame:/nowhere.pkl"), "nowhere"),
+        (("-o", "talk.npz", "--model", "nowhere/at-all"), "nowhere"),
+    ],
+)
+def test_bad_options_are_one_line_exit_2_and_no_file(speech, words, named, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert run("animate", speech, *words) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert named in error
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_silence_and_fifty_milliseconds_and_telephone(tmp_path):
+    soundfile.write(tmp_path / "silence.wav", np.zeros(8000), 16000)
+    soundfile.write(tmp_path / "short.wav", 0.1 * np.ones(800), 16000)
+    soundfile.write(tmp_path / "phone.wav", np.zeros((4000, 2)), 8000, subtype="PCM_24")
+    for name, frames in {"silence": 15, "short": 2, "phone": 15}.items():
+        out = tmp_path / f"{name}.npz"
+        assert run("animate", tmp_path / f"{name}.wav", "-o", out) == 0
+        assert len(MeshSequence.load(out)) == frames
