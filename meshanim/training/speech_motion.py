@@ -64,7 +64,8 @@ class Clip:
 class FeatureCache:
     """Speech features of sound files on disk, for one encoder, clean and degraded.
 
-    An entry belongs to what the encoder gives for a fixed noise, so that a retrained encoder starts anew.
+    An entry belongs to its sound and to what the encoder gives for a fixed noise: a changed file or a
+    retrained encoder starts anew.
 
     Parameters
     ----------
@@ -101,7 +102,8 @@ class FeatureCache:
         others : sequence of (samples,) arrays
             Voices that noise may be made of, 16 kHz.
         """
-        path = self.folder / f"{name}.{variant}.npz"
+        sound = hashlib.blake2b(audio.samples.tobytes(), digest_size=6).hexdigest()
+        path = self.folder / f"{name}-{sound}.{variant}.npz"
         if not path.exists():
             if variant:
                 digest = hashlib.blake2b(f"{name}.{variant}.{self.seed}".encode(), digest_size=8).digest()
