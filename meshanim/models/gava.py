@@ -62,6 +62,8 @@ class GavaConfig:
         Codes read from a speech window, and scalar fields over the vertices that they modulate.
     channels : int
         Features of the speech encoder's convolutions.
+    dropout : float
+        Of the speech encoder's features while training.
     eigenfunctions : int
         Laplace-Beltrami eigenfunctions among a vertex's descriptors.
     rings, self_loops
@@ -100,6 +102,7 @@ class GavaConfig:
     pose: bool = True
     rank: int = 64
     channels: int = 128
+    dropout: float = 0.0
     eigenfunctions: int = 64
     rings: int = 1
     self_loops: bool = True
@@ -174,7 +177,9 @@ class Gava(nn.Module, PyTorchModelHubMixin):
         nn.init.normal_(self.emotion_styles.weight, std=0.1)
 
         code = 2 * config.channels
-        self.speech = WindowEncoder(config.feature_dim, config.window, config.style, config.channels, code)
+        self.speech = WindowEncoder(
+            config.feature_dim, config.window, config.style, config.channels, code, config.dropout
+        )
         self.embedding = VertexEmbedding(surface.descriptors.shape[1], 2 * rank, rank)
         self.to_token = nn.Parameter(torch.randn(rank, width) * rank**-0.5)
         self.codes = nn.Linear(code, rank) if "L" in config.features else None

@@ -114,10 +114,13 @@ class WindowEncoder(nn.Module):
         Features of the convolutions.
     out : int
         Features of the code.
+    dropout : float
+        While training, of every hidden feature.
     """
 
-    def __init__(self, dim: int, window: int, style: int, channels: int, out: int):
+    def __init__(self, dim: int, window: int, style: int, channels: int, out: int, dropout: float = 0.0):
         super().__init__()
+        self.dropout = nn.Dropout(dropout)
         self.project = nn.Linear(dim, channels)
         self.style = nn.Linear(style, channels, bias=False)
         layers, steps = [], window
@@ -132,7 +135,8 @@ class WindowEncoder(nn.Module):
     ) -> Float[Tensor, "batch out"]:
         steps = functional.gelu(self.project(window) + self.style(style)[:, None]).transpose(1, 2)
         for convolution in self.convolutions:
-            steps = functional.gelu(convolution(steps))
+            steps = functional.gelu(convolution(self.dropout(steps)))
+        steps = self.dropout(steps)
         return functional.gelu(self.read(steps.flatten(1)))
 
 

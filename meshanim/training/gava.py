@@ -212,6 +212,8 @@ class TrainGavaOptions:
     """Attention on so many vertices, spread by what moves; 0 for one token a vertex."""
     rank: int = 128
     """Codes that modulate the vertex embeddings."""
+    dropout: float = 0.0
+    """Of the speech encoder's features."""
     pose: bool = True
     """Whether the head pose is learned."""
     batch_windows: int = 4
@@ -260,6 +262,7 @@ def train_gava(options: TrainGavaOptions, progress: bool = True) -> Path:
         heads=options.heads,
         tokens=options.tokens or "vertices",
         rank=options.rank,
+        dropout=options.dropout,
         pose=options.pose,
         subjects=styles,
         emotions=emotions,
