@@ -22,9 +22,9 @@ def test_one_clear_frame_seals_and_ramps():
 
 def test_weak_evidence_needs_two_frames():
     posterior = torch.zeros(20)
-    posterior[5] = 0.4
+    posterior[5] = 0.3
     assert seal_envelope(posterior, 30.0).max() == 0
-    posterior[6] = 0.4
+    posterior[6] = 0.3
     assert (seal_envelope(posterior, 30.0)[5:7] == 1).all()
 
 
