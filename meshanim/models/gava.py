@@ -157,6 +157,14 @@ class Gava(nn.Module, PyTorchModelHubMixin):
     """
 
     config: GavaConfig
+    surface: VertexTokens
+    feature_mean: Tensor
+    feature_scale: Tensor
+    mel_mean: Tensor
+    mel_scale: Tensor
+    pose_mean: Tensor
+    pose_scale: Tensor
+    decoder: TransformerDecoder | GlobalDecoder
 
     def __init__(self, config: GavaConfig, surface: TriangleMesh | VertexTokens):
         super().__init__()
@@ -188,7 +196,7 @@ class Gava(nn.Module, PyTorchModelHubMixin):
         self.pose_feature = PoseEncoder(config.mel_bands, config.style, width) if config.pose else None
         if config.decoder == "mlp":
             inputs = width if config.features == "G" else width * surface.n_tokens
-            self.decoder: nn.Module = GlobalDecoder(inputs, width * config.pose, width, surface.n_tokens)
+            self.decoder = GlobalDecoder(inputs, width * config.pose, width, surface.n_tokens)
         else:
             self.decoder = TransformerDecoder(
                 width, config.layers, config.heads, config.expansion, dense=config.decoder == "sa"
@@ -278,9 +286,9 @@ class Gava(nn.Module, PyTorchModelHubMixin):
         self._check(window, mel)
         code = self.speech((window - self.feature_mean) / self.feature_scale, style)
         pose = None
-        if self.pose_feature is not None:
+        if self.pose_feature is not None and mel is not None:
             pose = self.pose_feature((mel - self.mel_mean) / self.mel_scale, style)
-        if self.config.decoder == "mlp" and self.config.features == "G":
+        if self.global_attribute is not None and self.config.decoder == "mlp" and self.codes is None:
             return self.global_attribute(code)[:, None], pose
         # Modulating the rows of the small matrix is the same as modulating every vertex's embedding.
         if self.codes is None:
@@ -329,7 +337,7 @@ class Gava(nn.Module, PyTorchModelHubMixin):
             If an input is empty, of another shape than the network's, or holds NaN.
         """
         features, pose_feature = self.tokens(window, mel, embedding, style, subject)
-        if self.config.decoder == "mlp":
+        if isinstance(self.decoder, GlobalDecoder):
             moved, turned = self.decoder(features.flatten(1), pose_feature)
         else:
             if pose_feature is not None:
@@ -391,7 +399,7 @@ class Gava(nn.Module, PyTorchModelHubMixin):
             temporary.write_text(json.dumps(asdict(self.config), indent=2) + "\n")
 
     @classmethod
-    def _from_pretrained(
+    def _from_pretrained(  # type: ignore[override]
         cls,
         *,
         model_id: str,

@@ -198,6 +198,7 @@ class VertexEmbedding(nn.Module):
     ) -> Float[Tensor, "subjects tokens rank"]:
         """Embed the vertices of each subject; `identity` is template minus reference in centimetres."""
         first = self.network[0]
+        assert isinstance(first, nn.Linear)
         shared = functional.linear(descriptors, first.weight[:, :-3], first.bias)
         hidden = shared + functional.linear(identity, first.weight[:, -3:])
         for layer in list(self.network)[1:]:
@@ -294,11 +295,19 @@ class TransformerDecoder(nn.Module):
         pose = self.pose(tokens[:, -1]) if graph.global_token else None
         return self.displacement(tokens[:, : graph.n_vertices]), pose
 
+    def start_as_identity(self) -> None:
+        """Make every block give what it is given, until it learns."""
+        for block in self.blocks:
+            assert isinstance(block, _Block)
+            _zero(block.attention.project_out)
+            _zero(block.narrow)
+
     @torch.no_grad()
     def maps(self, tokens: Float[Tensor, "batch tokens width"], graph: MeshGraph) -> list[AttentionMaps]:
         """The attention maps of every block."""
         maps = []
         for block in self.blocks:
+            assert isinstance(block, _Block)
             maps.append(block.attention.maps(block.norm_attention(tokens), graph))
             tokens = block(tokens, graph)
         return maps

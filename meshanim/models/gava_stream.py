@@ -213,15 +213,15 @@ class _Input:
 
     def __init__(self, rate: float, width: int):
         self.rate, self.width = rate, width
-        self.kept: Tensor | None = None
+        self.kept = torch.zeros(0, 0)
         self.offset = 0
 
     @property
     def received(self) -> int:
-        return 0 if self.kept is None else self.offset + len(self.kept)
+        return self.offset + len(self.kept)
 
     def push(self, array: Tensor) -> None:
-        self.kept = array if self.kept is None else torch.cat([self.kept, array])
+        self.kept = torch.cat([self.kept, array]) if len(self.kept) else array
 
     def _last(self, frame: int, fps: float) -> float:
         """Position of the last entry of a frame's window, as `feature_windows` computes it."""

@@ -70,6 +70,14 @@ class VertexTokens(nn.Module):
         (V, N), tokens to vertices; not given where every vertex is a token.
     """
 
+    template: Tensor
+    faces: Tensor
+    edges: Tensor
+    descriptors: Tensor
+    amplitude: Tensor
+    vertices: Tensor
+    prolongation: SparseRows | None
+
     def __init__(
         self,
         template: Float[Tensor, "vertices 3"],
@@ -138,11 +146,13 @@ class VertexTokens(nn.Module):
         """
         try:
             names = ("template", "faces", "edges", "descriptors", "amplitude", "vertices")
-            parts = [state[name] for name in names]
+            prolongation = None
             if "prolongation.values" in state:
-                entries = (state[f"prolongation.{part}"] for part in ("rows", "columns", "values"))
-                parts.append(SparseRows(*entries, (len(state["template"]), len(state["vertices"]))))
-            return cls(*parts)
+                rows, columns, values = (state[f"prolongation.{k}"] for k in ("rows", "columns", "values"))
+                shape = (len(state["template"]), len(state["vertices"]))
+                prolongation = SparseRows(rows, columns, values, shape)
+            template, faces, edges, descriptors, amplitude, vertices = (state[name] for name in names)
+            return cls(template, faces, edges, descriptors, amplitude, vertices, prolongation)
         except KeyError as error:
             raise FileFormatError(f"the checkpoint lacks surface.{error.args[0]}") from error
 

@@ -180,7 +180,9 @@ class GavaTask:
         return loss, terms
 
     def save(self, model: nn.Module, directory: Path) -> None:
-        model.gava.save_pretrained(directory)
+        gava = model.gava
+        assert isinstance(gava, Gava)
+        gava.save_pretrained(directory)
 
 
 @dataclass(frozen=True)
@@ -303,7 +305,7 @@ def train_gava(options: TrainGavaOptions, progress: bool = True) -> Path:
     )
     if not trainer.resume() and options.warm.steps:
         device = trainer.accelerator.device
-        warm_start(trainer.bare.gava, task, components, options.warm, device, progress)
+        warm_start(model.to(device), task, components, options.warm, device, progress)
         trainer.reset_average()
     trainer.run(progress=progress)
     return options.output / "model"

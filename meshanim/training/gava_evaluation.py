@@ -17,7 +17,7 @@ from meshanim.errors import OptionError
 from meshanim.heads import Head, load_head
 from meshanim.models.gava import Gava
 from meshanim.models.gava_stream import GavaStream, PoseSmoothing, animate
-from meshanim.motion.lip_seal import LipSeal, head_lip_seal
+from meshanim.motion.lip_seal import LipSeal, head_lip_pairs, head_lip_seal
 from meshanim.results import Results
 from meshanim.training.metrics import (
     axis_dynamics_deviation,
@@ -100,13 +100,14 @@ def evaluate_gava(options: EvaluateGavaOptions, progress: bool = True) -> Result
                 dataset, head, split, predict, f"{split}: {name}", progress
             ).items():
                 results.add(split, name, metric, value, unit)
-    if head is not None and getattr(head, "lip_pairs", None) is not None:
+    pairs = head_lip_pairs(head)
+    if pairs is not None:
         rows = articulation(
             (
                 (s.vertices, s.phonemes, s.info.fps)
                 for s in map(dataset.__getitem__, dataset.split(options.splits[0]))
             ),
-            head.lip_pairs,
+            pairs,
         )
         for metric, value in rows.items():
             results.add(options.splits[0], "truth", metric, value, "share")
@@ -119,7 +120,7 @@ def evaluate_gava(options: EvaluateGavaOptions, progress: bool = True) -> Result
                         (spoken(model, encoder, clip.waveform, seal=seal), clip.phonemes, model.config.fps)
                         for clip in clips
                     )
-                    for metric, value in articulation(moved, head.lip_pairs).items():
+                    for metric, value in articulation(moved, pairs).items():
                         results.add("human clips", label, metric, value, "share")
     if options.json is not None:
         results.save(options.json)
@@ -206,7 +207,7 @@ def measure(
     """Every metric that the regions allow: errors are means over frames, deviations means over sequences."""
     regions: Mapping[str, np.ndarray] = {} if head is None else head.regions
     eyes = np.union1d(regions.get("eyelids", []), regions.get("eyes", [])).astype(np.int64)
-    pairs = getattr(head, "lip_pairs", None)
+    pairs = head_lip_pairs(head)
     frames: list[int] = []
     columns: dict[str, list[float]] = {}
     closed: list[bool] = []
@@ -231,9 +232,9 @@ def measure(
             spans = [(p.start, p.end) for p in sequence.phonemes if p.symbol in BILABIALS]
             closed += bilabial_closure(found, true, pairs, spans, sequence.info.fps)
     rows = {}
-    for metric, values in columns.items():
+    for metric, column in columns.items():
         weights = None if metric in ("FDD", "AFDD") else frames
-        rows[metric] = (float(np.average(values, weights=weights)), "mm")
+        rows[metric] = (float(np.average(np.array(column), weights=weights)), "mm")
     if closed:
         rows["bilabials closed"] = (float(np.mean(closed)), "share")
     return rows

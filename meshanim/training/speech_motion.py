@@ -125,7 +125,8 @@ def _degraded(audio: Waveform, generator: np.random.Generator, others: Sequence[
     def babble(rng: np.random.Generator, count: int) -> np.ndarray:
         voices = [others[int(rng.integers(len(others)))] for _ in range(int(rng.integers(3, 7)))]
         shifts = [int(rng.integers(len(voice))) for voice in voices]
-        return sum(np.resize(np.roll(v, s), count) for v, s in zip(voices, shifts)).astype(np.float32)
+        mixed = np.stack([np.resize(np.roll(v, s), count) for v, s in zip(voices, shifts)])
+        return mixed.sum(0).astype(np.float32)
 
     samples = audio.resampled(WAVEFORM_RATE).samples
     return Waveform(degrade(samples[None], generator, babble)[0].numpy(), WAVEFORM_RATE)

@@ -197,10 +197,8 @@ def config_pose(model: Gava) -> bool:
 def _start_heads(model: Gava, readout: nn.Linear, count: int) -> None:
     """Code 3 k + a carries component k along axis a in token feature a; the rest keeps vertices apart."""
     fields = 3 * count
-    for block in model.decoder.blocks:
-        for layer in (block.attention.project_out, block.narrow):
-            nn.init.zeros_(layer.weight)
-            nn.init.zeros_(layer.bias)
+    assert isinstance(model.decoder, TransformerDecoder)
+    model.decoder.start_as_identity()
     model.to_token[:fields, 3:] *= 0.2
     model.to_token[:, :3] = 0
     for axis in range(3):

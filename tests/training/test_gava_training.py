@@ -61,13 +61,12 @@ def test_it_learns_to_speak_from_a_random_start(corpus, tmp_path):
 )
 def test_a_warm_start_is_near_the_answer(corpus, tmp_path, changes):
     warm = WarmStart(steps=60, batch_windows=8, components=3, learning_rate=1e-2, field_steps=80)
-    train = TrainConfig(steps=8, learning_rate=1e-3, log_every=1000, save_every=1000, ema=0.9)
+    steps = 60 if changes.get("decoder") == "mlp" else 8
+    train = TrainConfig(steps=steps, learning_rate=1e-3, log_every=1000, save_every=1000)
     model = train_gava(options(corpus, tmp_path / "warm", warm=warm, train=train, **changes), progress=False)
     found = errors(corpus, [model])
     (name,) = {name for _, name in found} - {"template held still", "mean of training"}
-    assert (
-        found["test", name] < (0.9 if changes.get("decoder") else 0.6) * found["test", "template held still"]
-    )
+    assert found["test", name] < 0.6 * found["test", "template held still"]
     assert found["test", name] < found["test", "mean of training"]
 
 
