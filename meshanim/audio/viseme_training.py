@@ -8,7 +8,7 @@ import json
 import math
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, cast
 
 import numpy as np
 import torch
@@ -270,7 +270,7 @@ def train(corpus: str | Path, folder: str | Path, config: TrainingConfig = Train
                     path,
                 )
             about = {"steps": step + 1, "hours": _hours(utterances), "config": asdict(config)}
-            save_viseme_net(averaged.module, folder / "visemes.safetensors", about)
+            save_viseme_net(cast(VisemeNet, averaged.module), folder / "visemes.safetensors", about)
             mean_loss, accuracy = np.mean(window, axis=0)
             window.clear()
             with (folder / "log.jsonl").open("a") as log:
@@ -307,7 +307,7 @@ class Train:
 
 
 def main() -> None:
-    job = tyro.cli(Speak | Train)  # type: ignore[call-overload]
+    job = tyro.cli(Speak | Train)
     if isinstance(job, Speak):
         speak_corpus(job.folder, job.hours, job.seed, job.processes)
     else:

@@ -7,7 +7,7 @@ A temporal convolution net of 0.8 M parameters that runs on files and on streams
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 import torch
@@ -146,10 +146,15 @@ class VisemeNet(nn.Module):
         self.register_buffer("prior_mean", torch.full((config.bands,), -6.0))
         self.register_buffer("prior_variance", torch.full((config.bands,), 9.0))
 
+    @property
+    def stages(self) -> list[PaddedLayer]:
+        """The layers in order."""
+        return cast(list[PaddedLayer], list(self.layers))
+
     def hidden(self, mel: Float[Tensor, "batch bands mel_frames"]) -> Float[Tensor, "batch width frames"]:
         """Channels before the heads; frames = ceil(mel_frames / 2)."""
         hidden = mel
-        for layer in self.layers:
+        for layer in self.stages:
             hidden = layer(F.pad(hidden, (layer.left, layer.right)))
         return hidden
 
@@ -176,15 +181,15 @@ class HiddenStream:
 
     def __init__(self, net: VisemeNet):
         self.net = net
-        widths = [net.config.bands] + [net.config.width] * (len(net.layers) - 1)
-        self.kept = [torch.zeros(1, w, layer.left) for w, layer in zip(widths, net.layers)]
+        widths = [net.config.bands] + [net.config.width] * (len(net.stages) - 1)
+        self.kept = [torch.zeros(1, w, layer.left) for w, layer in zip(widths, net.stages)]
 
     def push(
         self, mel: Float32[Tensor, "1 bands mel_frames"], last: bool = False
     ) -> Float32[Tensor, "1 width frames"]:
         """Channels of the frames that are complete; `last` ends the stream with zeros, as files end."""
         hidden = mel
-        for k, layer in enumerate(self.net.layers):
+        for k, layer in enumerate(self.net.stages):
             joined = torch.cat([self.kept[k], hidden], dim=-1)
             if last:
                 joined = F.pad(joined, (0, layer.right))
@@ -343,10 +348,9 @@ def load_viseme_net(path: str | Path = WEIGHTS) -> VisemeNet:
     """
     path = Path(path)
     try:
-        config = json.loads(path.with_suffix(".json").read_text())["config"]
-        net = VisemeNet(
-            VisemeNetConfig(**{k: tuple(v) if isinstance(v, list) else v for k, v in config.items()})
-        )
+        config: dict[str, Any] = json.loads(path.with_suffix(".json").read_text())["config"]
+        sizes: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in config.items()}
+        net = VisemeNet(VisemeNetConfig(**sizes))
         tensors = {k: v.float() for k, v in load_file(path).items()}
         missing, unexpected = net.load_state_dict(tensors, strict=False)
         lost = [k for k in missing if not k.endswith("num_batches_tracked")] + unexpected
