@@ -48,6 +48,7 @@ def test_people_are_made_whole(head, assets, name):
     assert {"hair", "brow", "lash"} <= kinds
     for strands in appearance.strands:
         assert np.isfinite(strands.offsets).all()
+        assert strands.normals.shape[1] <= 16  # what the renderer draws
         assert np.linalg.norm(strands.offsets, axis=2).max() < 0.45
         assert (strands.occlusion >= 0).all()
         assert (strands.occlusion <= 1).all()

@@ -10,7 +10,7 @@ __all__ = ["Strands", "attach", "strand_points", "triangle_frames"]
 
 @dataclass(frozen=True)
 class Strands:
-    """n hairs of one kind, each a polyline of k + 1 points from its root.
+    """n hairs of one kind, each a polyline of k + 1 points from its root, 16 at most.
 
     Everything is stored in the frame of the triangle that carries the root (`triangle_frames`), so strands
     follow identity, expression and pose: point j of a strand is root + frame @ offsets[j - 1].
