@@ -109,6 +109,8 @@ class Quality:
         Subsurface scattering.
     strands : tuple of str
         Kinds of strands that are drawn.
+    strand_step : int
+        Draw every so many strands of hair and beard, and those wider.
     texture_scale : float
         Texels wanted a pixel; more is sharper.
     """
@@ -121,6 +123,7 @@ class Quality:
     lobes: int = 2
     scatter: bool = True
     strands: tuple[str, ...] = field(default=("lash", "brow", "beard", "hair"))
+    strand_step: int = 1
     texture_scale: float = 1.0
 
     def native(self, pixels_per_metre: float):
@@ -146,7 +149,8 @@ DRAFT = Quality(
     occlusion_taps=0,
     lobes=1,
     scatter=False,
-    strands=("lash", "brow"),
+    strand_step=5,
+    texture_scale=0.8,
 )
 
 

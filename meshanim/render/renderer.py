@@ -52,7 +52,7 @@ class Renderer:
     width, height : int
         Pixels; ignored where a camera is given.
     quality : str or Quality
-        "draft" (soft light, shadows, brows and lashes) or "full" (anti-aliasing, subsurface scattering,
+        "draft" (soft light, shadows, fewer and wider hairs) or "full" (anti-aliasing, subsurface scattering,
         hair, contact shadows).
     camera : Camera, optional
         Frames the resting head from the front, if not given.
@@ -101,7 +101,7 @@ class Renderer:
         self.threads = threads
         distance = float(self.camera.to_camera(appearance.template.mean(0)[None])[0, 2])
         scale = self.camera.intrinsics[1, 1] / max(distance, self.camera.near)
-        self.scene = HeadScene(appearance, scale, self.quality.texture_scale)
+        self.scene = HeadScene(appearance, scale, self.quality)
         self._stage = self.scene.stage()
         self._canvas = Canvas(self.camera.width, self.camera.height, self.quality)
         self._regions: tuple[np.ndarray, tuple[str, ...]] | None = None

@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from scipy.ndimage import gaussian_filter
 
 from meshanim.render.frame import Geometry
+from meshanim.render.lighting import Quality
 from meshanim.render.look import Appearance, eye_mesh
 from meshanim.render.look.eyes import similarity
 from meshanim.render.look.paint import smoothstep
@@ -33,11 +34,10 @@ class HeadScene:
     appearance : Appearance
     pixels_per_metre : float
         Scale of the picture at the head; textures are reduced to fit it.
-    texture_scale : float
-        Texels wanted a pixel.
+    quality : Quality
     """
 
-    def __init__(self, appearance: Appearance, pixels_per_metre: float, texture_scale: float = 1.0):
+    def __init__(self, appearance: Appearance, pixels_per_metre: float, quality: Quality):
         self.appearance = appearance
         surfaces = (appearance.surface, appearance.tongue)
         operator = sp.csr_array(sp.vstack([surface.operator for surface in surfaces]))
@@ -66,7 +66,7 @@ class HeadScene:
         self.fade[: counts[0]] = _neck_opacity(rest, appearance.neck_fade)
 
         density = _texel_density(rest, appearance)
-        level = np.log2(max(density / (pixels_per_metre * texture_scale), 1e-6))
+        level = np.log2(max(density / (pixels_per_metre * quality.texture_scale), 1e-6))
         self.level = int(np.clip(np.floor(level + 0.5), 0, 3))
         self.skin = _reduced(appearance.skin, self.level)
         self.relief = _reduced(_slopes(appearance.height), self.level)
@@ -76,7 +76,7 @@ class HeadScene:
         self.detail = _reduced(appearance.detail, int(min(detail_level, 5)))
         self.detail_gain = float(np.clip((pixels_per_metre / 1000 - 1.2) / 2.5, 0, 1))
         self.lids = [_lids(appearance, side, rest) for side in (0, 1)]
-        self.strands = _native_strands(appearance)
+        self.strands = _native_strands(appearance, quality.strand_step)
 
     def stage(self) -> "HeadStage":
         """A pose of this scene with buffers of its own, for one thread of frames."""
@@ -242,34 +242,41 @@ def _fold(patch, size: int, level: int) -> _Fold:
 
 def _lids(appearance: Appearance, side: int, rest: np.ndarray, count: int = 20) -> tuple[_Lid, _Lid]:
     """Margins of the upper and lower lid of one eye: where the lashes are rooted."""
-    eye = appearance.eyes[side]
-    sign = np.sign(eye.center[0])
-    lids = {}
-    for lashes in (group for group in appearance.strands if group.kind == "lash"):
+    sign = np.sign(appearance.eyes[side].center[0])
+    lids = []
+    for lashes in (group for group in appearance.strands if group.kind == "lash" and len(group)):
         corners = appearance.surface.faces[lashes.triangle]
         root = np.einsum("nkd,nk->nd", rest[corners], lashes.barycentric)
         if np.sign(root[:, 0].mean()) != sign:
             continue
         order = np.argsort(root[:, 0], kind="stable")
         chosen = order[np.unique(np.linspace(0, len(order) - 1, count).round().astype(int))]
-        upward = root[:, 1].mean() > eye.center[1]
-        lids["upper" if upward else "lower"] = _Lid(corners[chosen], lashes.barycentric[chosen])
-    none = _Lid(np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
-    return lids.get("upper", none), lids.get("lower", none)
+        lids.append((root[:, 1].mean(), _Lid(corners[chosen], lashes.barycentric[chosen])))
+    if len(lids) != 2:
+        nothing = _Lid(np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
+        return nothing, nothing
+    lids.sort(key=lambda pair: pair[0], reverse=True)
+    return lids[0][1], lids[1][1]
 
 
-def _native_strands(appearance: Appearance) -> dict[str, list]:
-    """The kernels' form of the strands, by kind."""
+def _native_strands(appearance: Appearance, step: int) -> dict[str, list]:
+    """The kernels' form of the strands, by kind; every `step`-th hair stands for its neighbours."""
     from meshanim import _native
 
     groups: dict[str, list] = {}
     for strands in appearance.strands:
-        if not len(strands):
+        every = step if strands.kind in ("hair", "beard") else 1
+        arrays = {
+            name: getattr(strands, name)[::every]
+            for name in ("triangle", "barycentric", "offsets", "normals", "occlusion", "width", "color")
+        }
+        arrays["width"] = arrays["width"] * every**0.8
+        if not len(arrays["width"]):
             continue
         native = _native.Strands(
             *(
-                np.ascontiguousarray(getattr(strands, name), np.int32 if name == "triangle" else np.float32)
-                for name in ("triangle", "barycentric", "offsets", "normals", "occlusion", "width", "color")
+                np.ascontiguousarray(array, np.int32 if name == "triangle" else np.float32)
+                for name, array in arrays.items()
             )
         )
         groups.setdefault(strands.kind, []).append(native)

@@ -17,6 +17,7 @@ constexpr float PI = 3.14159265f;
 constexpr float SPECULAR_NORMAL = 0.028f;    // Fresnel reflectance of skin at normal incidence
 constexpr float INSIDE = 0.15f;              // light that reaches the inner side of an open surface
 constexpr float SAME_SURFACE = 0.0025f;      // metres between samples of one fragment
+constexpr float SEAM = 10.0f;                // texture coordinates a metre; more between samples is another island
 constexpr float IRIS_ANGLE = 0.345f, IRIS_PLANE = 0.925f, SCLERA_ANGLE = 1.95f, REFRACTIVE_INDEX = 1.34f;
 
 template <int CHANNELS> inline void sample(const Texture &t, float u, float v, float *out) {
@@ -147,7 +148,7 @@ inline float vertex_value(const float *values, const int32_t *f, const float *w)
 }
 
 // Collect the fragments of one row of pixels.
-int gather(const Mesh &mesh, const Part *parts, const Eye &eye, int samples, int width, int y, const int32_t *face,
+int gather(const Mesh &mesh, const Part *parts, const Eye &eye, int samples, float seam, int width, int y, const int32_t *face,
            const float *depth, Fragments &r) {
     int n = 0;
     const int total = samples * samples, stride = samples * width;
@@ -169,9 +170,12 @@ int gather(const Mesh &mesh, const Part *parts, const Eye &eye, int samples, int
             const int part = mesh.part[first];
             int member[4], count = 0;
             bool one_face = true;
+            const Vec facing = load(mesh.normals + 3 * mesh.faces[3 * first]);
             float mx = 0, my = 0;
             for (int t = s; t < total; ++t) {
                 if (f[t] < 0 || mesh.part[f[t]] != part || std::abs(z[t] - near) > SAME_SURFACE) continue;
+                // Closed lips and lids touch, but face each other.
+                if (f[t] != first && dot(facing, load(mesh.normals + 3 * mesh.faces[3 * f[t]])) < 0.2f) continue;
                 mx += (t % samples + 0.5f) * step, my += (t / samples + 0.5f) * step;
                 one_face &= f[t] == first;
                 member[count++] = t;
@@ -189,7 +193,7 @@ int gather(const Mesh &mesh, const Part *parts, const Eye &eye, int samples, int
                 const float *uv = mesh.corner_uv + 6 * int64_t(f[t]), *w = hit.weight;
                 float a = uv[0] * w[0] + uv[2] * w[1] + uv[4] * w[2], b = uv[1] * w[0] + uv[3] * w[1] + uv[5] * w[2];
                 if (k == 0) u0 = a, v0 = b;
-                if (std::abs(a - u0) + std::abs(b - v0) > 0.03f) a = u0, b = v0;      // another island
+                if (std::abs(a - u0) + std::abs(b - v0) > seam) a = u0, b = v0;      // another island
                 u += a, v += b;
                 sky += vertex_value(mesh.sky, corner, w) * (hit.back ? INSIDE : 1.0f), fade += vertex_value(mesh.fade, corner, w);
                 if (mesh.colors)
@@ -432,7 +436,7 @@ void shade(const Mesh &mesh, const Part *parts, const View &view, const Lighting
             const int64_t row = int64_t(y) * width;
             for (int plane = 0; plane < PLANES; ++plane) std::fill(planes + plane * area + row, planes + plane * area + row + width, 0.0f);
             std::fill(near + row, near + row + width, 1e6f);
-            const int n = gather(mesh, parts, eye, quality.samples, width, y, face, depth, r);
+            const int n = gather(mesh, parts, eye, quality.samples, SEAM / quality.pixels_per_metre, width, y, face, depth, r);
             for (int i = 0; i < n; ++i) {
                 const Part &part = parts[r.part[i]];
                 material(mesh, part, quality, r, i);
