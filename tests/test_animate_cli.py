@@ -48,6 +48,26 @@ def test_npz_glb_and_sheet(speech, tmp_path):
     assert Image.open(tmp_path / "talk.png").size == (6 * 32, 2 * 32)
 
 
+def test_another_head_by_correspondence(speech, tmp_path):
+    """A rig of another topology moves its lips where the default head would."""
+    from meshanim.geometry import decimate
+    from meshanim.heads import load_head
+
+    head = load_head("default")
+    small = decimate(head.mesh, 2500)
+    mesh, jaw = small.mesh, head.deform(None, head.expression({"jawOpen": 1.0}))[0].numpy()
+    deltas = (small.operator @ (jaw - head.mesh.vertices))[None]
+    np.savez(tmp_path / "rig.npz", neutral=mesh.vertices, faces=mesh.faces, deltas=deltas, names=["jawOpen"])
+    out = tmp_path / "talk.npz"
+    assert run("animate", speech, "-o", out, "--head", f"rig:{tmp_path / 'rig.npz'}") == 0
+    sequence = MeshSequence.load(out)
+    assert sequence.vertices.shape == (10, mesh.n_vertices, 3)
+    moved = np.linalg.norm(sequence.vertices - mesh.vertices, axis=2).max(0)
+    mouth = np.abs(mesh.vertices - head.mesh.vertices[head.regions["lips"]].mean(0)).max(1) < 0.03
+    assert moved[mouth].max() > 5e-4
+    assert moved[mesh.vertices[:, 1] > 0.1].max() < 2e-3
+
+
 BAD = {
     "text named wav": lambda folder: (folder / "a.wav").write_text("hello"),
     "missing": lambda folder: None,

@@ -5,7 +5,8 @@ import resource
 import statistics
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -22,7 +23,10 @@ __all__ = ["BenchmarkOptions", "closed_mesh_faces", "run"]
 
 @dataclass(frozen=True)
 class BenchmarkOptions:
-    """Time mesh attention: `meshanim bench attention --json out.json`."""
+    """Time of mesh attention against dense attention and the layer's own projection.
+
+    Example: meshanim bench attention --json attention.json
+    """
 
     vertices: int = 5023
     """Vertices of the mesh that all implementations are compared on."""
@@ -36,7 +40,9 @@ class BenchmarkOptions:
     """Meshes on which the cost a vertex is measured."""
     memory_vertices: int = 200_000
     """Mesh of the training step whose peak memory is measured, in a process of its own; 0 for none."""
-    seed: int = field(default=0)
+    seed: int = 0
+    json: Path | None = None
+    """Also write the rows here."""
 
 
 def run(options: BenchmarkOptions | None = None) -> Results:

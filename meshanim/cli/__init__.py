@@ -16,7 +16,10 @@ __all__ = ["main"]
 VERBS = {
     "animate": "speech in; a video, glTF, npz or contact sheet of a talking head out",
     "demo": "the same on a recorded sentence that ships with the package",
+    "train": "train a model: gava",
+    "evaluate": "score a model on held-out data: gava",
     "data": "data sets: synthesize, check",
+    "bench": "measurements that anyone can repeat: attention, animate",
     "doctor": "what is installed, which backends work, how to get what is missing",
 }
 Command = Callable[[Any], object]

@@ -82,7 +82,9 @@ class _Scene:
         if isinstance(animator.head, DefaultHead):
             from meshanim.render.look import find_person, make_appearance
 
-            self.appearance = make_appearance(animator.head, find_person(options.person))
+            self.appearance = make_appearance(
+                animator.head, find_person(options.person), skin_image=options.skin
+            )
         elif options.skin is not None:
             raise OptionError("--skin paints the default head only")
 

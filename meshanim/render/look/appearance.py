@@ -1,6 +1,7 @@
 """`Appearance`: everything the renderer needs to draw one person on the default head."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -14,6 +15,7 @@ from meshanim.render.look.groom import skin_shade
 from meshanim.render.look.hair import grow_hair
 from meshanim.render.look.person import PersonParameters
 from meshanim.render.look.skin import micro_detail, paint_skin, paint_tongue
+from meshanim.render.look.skin_image import sample_skin_image
 from meshanim.render.look.strands import Strands
 from meshanim.render.look.surface import Surface, vertex_normals
 from meshanim.render.look.teeth import Teeth, make_teeth
@@ -87,6 +89,7 @@ def make_appearance(
     person: PersonParameters,
     size: int = 1024,
     assets: LookAssets | None = None,
+    skin_image: str | Path | None = None,
 ) -> Appearance:
     """Paint, groom and equip one person; the same arguments give the same arrays bit by bit.
 
@@ -99,8 +102,13 @@ def make_appearance(
     assets : LookAssets, optional
         From `look_assets(head, size)`, to make several people without preparing the head again.
 
+    skin_image : path, optional
+        A square picture in MakeHuman's texture layout, used in place of the painted albedo.
+
     Raises
     ------
+    FileFormatError
+        If `skin_image` is missing, no picture, or not square.
     OptionError
         If the head knows no such identity, or the person has more shape coefficients than the head.
     """
@@ -109,6 +117,8 @@ def make_appearance(
     template = _template(head, person, shape)
     on_skin = assets.skin.vertices(template)
     paint = paint_skin(assets.atlas, person)
+    if skin_image is not None:
+        paint.skin[assets.atlas.active, :3] = sample_skin_image(skin_image, assets.makehuman_uv)
     paint_tongue(assets.tongue_atlas, person, paint)
     strands, shade = grow_hair(assets.ground, paint, assets.lashes, person)
     sky = assets.sky

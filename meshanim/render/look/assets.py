@@ -32,6 +32,8 @@ class LookAssets:
         What hair grows on.
     lashes : tuple of LashGuide
         The four lids.
+    makehuman_uv : (n, 2) float32
+        Place of each active texel of the skin's atlas in MakeHuman's own texture layout.
     """
 
     vertices: Float[np.ndarray, "head_vertices 3"]
@@ -42,6 +44,7 @@ class LookAssets:
     sky: Float[np.ndarray, " surface_vertices"]
     ground: Ground
     lashes: tuple[LashGuide, ...]
+    makehuman_uv: Float[np.ndarray, "texels 2"]
 
 
 def look_assets(head: DefaultHead, size: int = 1024) -> LookAssets:
@@ -54,7 +57,8 @@ def look_assets(head: DefaultHead, size: int = 1024) -> LookAssets:
         Texels along one side of the skin texture.
     """
     vertices = head.mesh.vertices.astype(np.float32)
-    skin, tongue = (_part_surface(head, name) for name in ("skin", "tongue"))
+    skin, tongue = (_part_surface(head, name, head.atlas_uv) for name in ("skin", "tongue"))
+    original = _part_surface(head, "skin", head.uv).corner_uv
     masks = {"mouth" if name == "inside-mouth" else name: mask for name, mask in head.masks.items()}
     atlas = build_atlas(skin, vertices, masks, size)
     on_skin = skin.vertices(vertices)
@@ -77,11 +81,11 @@ def look_assets(head: DefaultHead, size: int = 1024) -> LookAssets:
         sky_visibility(on_skin, skin.faces),
         Ground(atlas, skin, on_skin, skin.operator @ masks["ears"]),
         lashes,
+        np.einsum("nkd,nk->nd", original[atlas.triangle], atlas.barycentric),
     )
 
 
-def _part_surface(head: DefaultHead, name: str) -> Surface:
+def _part_surface(head: DefaultHead, name: str, uv: np.ndarray) -> Surface:
     part = head.parts[name]
     rows, uv_quads = np.unique(part.uv_quads, return_inverse=True)
-    uv = head.atlas_uv[rows].astype(float)
-    return subdivided_surface(part.quads, uv, uv_quads.reshape(-1, 4), head.n_vertices)
+    return subdivided_surface(part.quads, uv[rows].astype(float), uv_quads.reshape(-1, 4), head.n_vertices)
