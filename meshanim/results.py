@@ -63,15 +63,15 @@ class Results:
         for row in self.rows:
             cells = lines.setdefault((row.case, row.implementation), {})
             cells[f"{row.metric} [{row.unit}]"] = f"{row.value:.4g}"
-        cells = [["case", "implementation", *metrics]]
-        cells += [[*name, *(values.get(metric, "") for metric in metrics)] for name, values in lines.items()]
-        widths = [max(map(len, column)) for column in zip(*cells)]
+        table = [["case", "implementation", *metrics]]
+        table += [[*name, *(values.get(metric, "") for metric in metrics)] for name, values in lines.items()]
+        widths = [max(map(len, column)) for column in zip(*table)]
         return "\n".join(
             "  ".join(
                 cell.ljust(width) if column < 2 else cell.rjust(width)
                 for column, (cell, width) in enumerate(zip(line, widths))
             ).rstrip()
-            for line in cells
+            for line in table
         )
 
 

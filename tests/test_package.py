@@ -1,3 +1,4 @@
+import os
 import subprocess
 import sys
 
@@ -36,3 +37,11 @@ def test_written_whole_leaves_nothing_behind(tmp_path):
 def test_written_whole_names_the_missing_folder(tmp_path):
     with pytest.raises(FileFormatError, match="nowhere"), written_whole(tmp_path / "nowhere" / "a.npz"):
         pass
+
+
+@pytest.mark.skipif(os.environ.get("MESHANIM_NATIVE") == "0", reason="the extension was switched off")
+def test_the_extension_was_built():
+    """A failed build installs without it, so that nobody is locked out; where tests run, it must be there."""
+    from meshanim import _native
+
+    assert _native.instruction_set() in ("generic", "avx2", "avx512")

@@ -83,8 +83,9 @@ def _compare(options: BenchmarkOptions, results: Results) -> None:
     projected = torch.randn(options.batch, graph.n_tokens, 3 * width)
 
     def dense(query: Tensor, key: Tensor, value: Tensor) -> Tensor:
-        heads_first = (tensor.transpose(1, 2) for tensor in (query, key, value))
-        return torch.nn.functional.scaled_dot_product_attention(*heads_first, attn_mask=mask).transpose(1, 2)
+        query, key, value = (tensor.transpose(1, 2) for tensor in (query, key, value))
+        attend = torch.nn.functional.scaled_dot_product_attention
+        return attend(query, key, value, attn_mask=mask).transpose(1, 2)
 
     def both(forward: Callable[[], Tensor], leaves: list[Tensor], gradient: Tensor) -> Callable[[], object]:
         return lambda: torch.autograd.grad(forward(), leaves, gradient)

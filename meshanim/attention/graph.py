@@ -1,6 +1,7 @@
 """`MeshGraph`: which vertex attends to which, as sparse rows and their transpose."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -181,8 +182,11 @@ class MeshGraph:
         """The same graph on another device; itself where it is there already."""
         if self.device == torch.device(device):
             return self
-        values = (getattr(self, field.name) for field in fields(self))
-        return MeshGraph(*(value.to(device) if isinstance(value, Tensor) else value for value in values))
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        moved: dict[str, Any] = {
+            name: value.to(device) for name, value in values.items() if isinstance(value, Tensor)
+        }
+        return replace(self, **moved)
 
     def allowed(self) -> Bool[Tensor, "tokens tokens"]:
         """Dense mask of (query, key), for tests and small meshes: quadratic in the vertices."""

@@ -12,6 +12,7 @@ from tqdm import tqdm
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from meshanim.animator import AnimationOptions, Animator
+from meshanim.audio import load_waveform
 from meshanim.errors import OptionError
 from meshanim.files import check_writable
 from meshanim.heads import DefaultHead
@@ -57,9 +58,10 @@ def animate(options: AnimateOptions) -> None:
     if options.size < 16 or options.size % 2:
         raise OptionError(f"size must be even and at least 16, not {options.size}")
     check_writable(options.output)
+    speech = load_waveform(options.speech, rate=None)
     animator = Animator.from_pretrained(options.model, options.head)
     scene = _Scene(animator, options)
-    sequence = animator(options.speech, options.performance, scene.template)
+    sequence = animator(speech, options.performance, scene.template)
     if ending == ".npz":
         sequence.save(options.output)
     elif ending == ".glb":

@@ -76,9 +76,7 @@ def write_video(
                 sound_sent = end
         if written == 0:
             raise ShapeError("a video needs at least one frame")
-        if audio is not None:
-            end = min(len(audio.samples), int(written / rate * audio.rate))
-            file.mux(_encode_sound(sound, audio, sound_sent, end))
+        if audio is not None and sound is not None:
             file.mux(sound.encode(None))
         file.mux(video.encode(None))
     return written

@@ -1,5 +1,7 @@
 """Parametric heads behind one interface."""
 
+from typing import Literal, overload
+
 from meshanim.errors import OptionError
 from meshanim.heads.default import DefaultHead, HeadPart, load_default_head
 from meshanim.heads.flame import FlameHead, load_flame
@@ -30,6 +32,10 @@ __all__ = [
 FLAME_KINDS = {"flame": "none", "flame+teeth": "plain", "flame+split_teeth": "split"}
 
 
+@overload
+def load_head(name: Literal["default"] = "default") -> DefaultHead: ...
+@overload
+def load_head(name: str) -> Head: ...
 def load_head(name: str = "default") -> Head:
     """Load a head by name.
 

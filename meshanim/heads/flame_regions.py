@@ -74,7 +74,7 @@ def regions_from_default(arrays: FlameArrays) -> dict[str, Int[np.ndarray, " _"]
     regions = _skinned(arrays)
     eyes = arrays.joint_regressor[list(EYE_JOINTS)] @ arrays.vertices
     own = default.rest_joints[list(EYE_JOINTS)].numpy()
-    scale = np.linalg.norm(own[0] - own[1]) / max(np.linalg.norm(eyes[0] - eyes[1]), 1e-9)
+    scale = np.linalg.norm(own[0] - own[1]) / max(float(np.linalg.norm(eyes[0] - eyes[1])), 1e-9)
     moved = (arrays.vertices - eyes.mean(0)) * scale + own.mean(0)
     skin = default.parts["skin"].vertices
     outer = skin[default.masks["inside-mouth"][skin] < 0.5]

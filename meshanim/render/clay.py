@@ -76,7 +76,7 @@ def render_mesh(
     if background.shape != (camera.height, camera.width, 3):
         raise ShapeError(f"background must be ({camera.height}, {camera.width}, 3), not {background.shape}")
     chosen = quality_named(quality)
-    srgb = np.broadcast_to(np.float32(CLAY), vertices.shape) if colors is None else colors
+    srgb = np.broadcast_to(np.array(CLAY, np.float32), vertices.shape) if colors is None else colors
     albedo = np.clip(srgb, 0, 1).astype(np.float32) ** np.float32(2.2)
     geometry = Geometry(mesh.faces, mesh.n_vertices, colors=albedo)
     geometry.vertices[:] = vertices

@@ -176,5 +176,5 @@ def backdrop(
     """A vertical gradient with darker corners, linear light, from two sRGB colours in [0, 1]."""
     y = np.linspace(0, 1, height, dtype=np.float32)[:, None, None]
     x = np.linspace(-1, 1, width, dtype=np.float32)[None, :, None]
-    color = np.float32(top) ** 2.2 * (1 - y) + np.float32(bottom) ** 2.2 * y
+    color = np.array(top, np.float32) ** 2.2 * (1 - y) + np.array(bottom, np.float32) ** 2.2 * y
     return np.ascontiguousarray(color * (1.12 - 0.15 * (x**2 + (2 * y - 1) ** 2)), np.float32)

@@ -64,10 +64,10 @@ def lip_line(vertices: Float[np.ndarray, "vertices 3"], quads: Int[np.ndarray, "
             best = height, loop
     if best is None:
         raise MeshError("no closed edge loop round the lips: is this MakeHuman's base mesh?")
-    loop = np.array(best[1])
-    left, right = x[loop].argmax(), x[loop].argmin()
-    upper = np.concatenate([loop[right:], loop[: left + 1]])
-    return LipLine(upper, loop[left : right + 1][::-1])
+    ring = np.array(best[1])
+    left, right = x[ring].argmax(), x[ring].argmin()
+    upper = np.concatenate([ring[right:], ring[: left + 1]])
+    return LipLine(upper, ring[left : right + 1][::-1])
 
 
 def seal_directions(

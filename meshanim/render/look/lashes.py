@@ -64,7 +64,8 @@ def lash_guide(
     distance = np.linalg.norm(points - center, axis=1)
     across = points[:, 0]
     inner, outer = across.min(), across.max()
-    near, far = [], []
+    near: list[int] = []
+    far: list[int] = []
     for left, right in zip(np.linspace(inner, outer, 11)[:-1], np.linspace(inner, outer, 11)[1:]):
         window = np.flatnonzero((across >= left - 1e-6) & (across <= right + 1e-6))
         if len(window):
