@@ -34,3 +34,12 @@ def test_doctor_reports_the_kernels(capsys):
     printed = capsys.readouterr().out
     assert "native" in printed
     assert "torch" in printed
+
+
+def test_runs_as_a_module():
+    import subprocess
+    import sys
+
+    done = subprocess.run([sys.executable, "-m", "meshanim", "--version"], capture_output=True, text=True)
+    assert done.returncode == 0
+    assert done.stdout.strip()[0].isdigit()

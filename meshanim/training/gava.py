@@ -193,7 +193,7 @@ class TrainGavaOptions:
     """
 
     data: Path
-    """Folder of a data set (meshanim data synthesize, meshanim data convert)."""
+    """Folder of a data set (`meshanim data synthesize` makes one)."""
     output: Path = Path("runs/gava")
     """Gets checkpoints/, tensorboard/ and model/; an interrupted run with the same options is continued."""
     encoder: str = "visemes"
