@@ -18,12 +18,12 @@ from meshanim.audio.features import frame_count
 from meshanim.errors import FileFormatError, OptionError
 from meshanim.geometry import TriangleMesh
 from meshanim.geometry.correspondence import surface_correspondence
-from meshanim.heads import DefaultHead, Head, load_head
+from meshanim.heads import Head, load_head
 from meshanim.models.gava import Gava
 from meshanim.models.gava_stream import GavaStream
 from meshanim.motion import MeshSequence
 from meshanim.motion.idle import IdleMotion
-from meshanim.motion.lip_seal import LipSeal
+from meshanim.motion.lip_seal import LipSeal, head_lip_seal
 
 __all__ = ["AnimationOptions", "AnimationStream", "Animator", "Frames"]
 
@@ -235,11 +235,7 @@ class Animator:
 
     def lip_seal(self) -> LipSeal | None:
         """The seal of the network's head; None where the head names no lip pairs or the encoder no class."""
-        head = self.model_head
-        if not isinstance(head, DefaultHead) or self.bilabial is None:
-            return None
-        closing = head.expression_directions[head.expression_names.index("mouthClose")]
-        return LipSeal(torch.from_numpy(head.lip_pairs), closing.reshape(-1, 3))
+        return None if self.bilabial is None else head_lip_seal(self.model_head)
 
     def open(
         self, rate: int = 16000, options: AnimationOptions | None = None, template: Template | None = None

@@ -1,6 +1,7 @@
 """The command line: `meshanim VERB`, one file a verb."""
 
 import importlib
+import os
 import sys
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -22,6 +23,9 @@ VERBS = {
     "bench": "measurements that anyone can repeat: attention, animate",
     "doctor": "what is installed, which backends work, how to get what is missing",
 }
+# Threads that wait by spinning slow each other down many times where other programs want the cores too.
+# Read when torch loads, which no verb has done yet.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 Command = Callable[[Any], object]
 
 
