@@ -144,12 +144,12 @@ FULL = Quality("full")
 DRAFT = Quality(
     "draft",
     samples=1,
-    shadow_pixel=0.0008,
-    shadow_taps=6,
+    shadow_pixel=0.0012,
+    shadow_taps=5,
     occlusion_taps=0,
     lobes=1,
     scatter=False,
-    strand_step=5,
+    strand_step=10,
     texture_scale=0.8,
 )
 
