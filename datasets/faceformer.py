@@ -19,6 +19,7 @@ from meshanim.audio import load_waveform, save_waveform
 from meshanim.datasets.meshanim_format import MotionSequence, SequenceInfo, Subject
 from meshanim.errors import FileFormatError, OptionError
 from meshanim.files import written_whole
+from meshanim.unpickle import load_pickle
 
 __all__ = ["FaceFormerDataset", "write_faceformer_sequence", "write_faceformer_templates"]
 
@@ -45,28 +46,6 @@ def write_faceformer_templates(directory: str | Path, subjects: Sequence[Subject
     written = written.replace(b"cnumpy._core.", b"cnumpy.core.")
     with written_whole(Path(directory) / "templates.pkl") as temporary:
         temporary.write_bytes(written)
-
-
-class _ArraysOnly(pickle.Unpickler):
-    """Builds dictionaries, strings, numbers and numpy arrays, and refuses anything else."""
-
-    allowed = frozenset(
-        (module, name)
-        for core in ("numpy.core", "numpy._core")
-        for module, name in (
-            (f"{core}.multiarray", "_reconstruct"),
-            (f"{core}.multiarray", "scalar"),
-            (f"{core}.numeric", "_frombuffer"),
-            ("numpy", "ndarray"),
-            ("numpy", "dtype"),
-            ("_codecs", "encode"),
-        )
-    )
-
-    def find_class(self, module: str, name: str) -> object:
-        if (module, name) not in self.allowed:
-            raise pickle.UnpicklingError(f"it names {module}.{name}, which is no array")
-        return super().find_class(module, name)
 
 
 class FaceFormerDataset:
@@ -114,13 +93,7 @@ class FaceFormerDataset:
 
     def _read_templates(self) -> dict[str, Float32[np.ndarray, "vertices 3"]]:
         path = self.directory / "templates.pkl"
-        try:
-            with open(path, "rb") as file:
-                templates = _ArraysOnly(file, encoding="latin1").load()
-        except OSError as error:
-            raise FileFormatError(f"cannot read {path}: {error.strerror}") from error
-        except (pickle.UnpicklingError, EOFError, ValueError, TypeError, AttributeError, IndexError) as error:
-            raise FileFormatError(f"{path} is no pickled dictionary of arrays: {error}") from error
+        templates = load_pickle(path)
         if not isinstance(templates, dict) or not all(
             isinstance(value, np.ndarray) and value.ndim == 2 and value.shape[1] == 3
             for value in templates.values()
