@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 
 from meshanim.errors import OptionError, ShapeError
 from meshanim.files import written_whole
+from meshanim.geometry import TriangleMesh
 from meshanim.motion import MeshSequence
 
 __all__ = ["GltfMaterial", "morph_basis", "write_glb"]
@@ -147,8 +148,11 @@ def write_glb(
     pivot = np.zeros(3) if pivot is None else np.asarray(pivot, np.float64)
     weight = np.ones(mesh.n_vertices) if pose_weights is None else np.asarray(pose_weights)
     materials = materials or [GltfMaterial("surface", np.arange(mesh.n_faces))]
+    normals = _normals(mesh)
+    changes = [_normals(mesh.with_vertices(template + target)) - normals for target in targets]
     primitives = [
-        _primitive(buffer, mesh, template, targets, weight, one, index) for index, one in enumerate(materials)
+        _primitive(buffer, mesh, targets, normals, changes, weight, one, index)
+        for index, one in enumerate(materials)
     ]
     bind = np.tile(np.eye(4, dtype=np.float32), (2, 1, 1))
     bind[1, 3, :3] = -pivot  # column-major: the translation is the last row
@@ -200,11 +204,13 @@ def _initial(weights: np.ndarray) -> dict:
     return {"weights": weights[0].tolist()} if weights.shape[1] else {}
 
 
-def _primitive(buffer, mesh, template, targets, weight, material: GltfMaterial, index: int) -> dict:
+def _primitive(
+    buffer, mesh: TriangleMesh, targets, normals, changes, weight, material: GltfMaterial, index: int
+) -> dict:
     faces = mesh.faces[material.faces]
     if material.uv is not None:
         uv_faces, uv = faces, material.uv
-    elif mesh.uv is not None:
+    elif mesh.uv is not None and mesh.uv_faces is not None:
         uv_faces, uv = mesh.uv_faces[material.faces], mesh.uv
     else:
         if material.texture is not None:
@@ -215,8 +221,12 @@ def _primitive(buffer, mesh, template, targets, weight, material: GltfMaterial, 
     # glTF has one index for all attributes: split vertices along texture seams.
     corners, inverse = np.unique(np.stack([faces, uv_faces], -1).reshape(-1, 2), axis=0, return_inverse=True)
     vertex = corners[:, 0]
-    attributes = {"POSITION": buffer.accessor(template[vertex], "VEC3", ARRAY_BUFFER, bounds=True)}
-    attributes["NORMAL"] = buffer.accessor(_normals(template, mesh.faces)[vertex], "VEC3", ARRAY_BUFFER)
+    attributes = {
+        "POSITION": buffer.accessor(
+            mesh.vertices[vertex].astype(np.float32), "VEC3", ARRAY_BUFFER, bounds=True
+        )
+    }
+    attributes["NORMAL"] = buffer.accessor(normals[vertex], "VEC3", ARRAY_BUFFER)
     if uv is not None:
         flipped = np.stack([uv[corners[:, 1], 0], 1 - uv[corners[:, 1], 1]], 1).astype(np.float32)
         attributes["TEXCOORD_0"] = buffer.accessor(flipped, "VEC2", ARRAY_BUFFER)
@@ -229,11 +239,9 @@ def _primitive(buffer, mesh, template, targets, weight, material: GltfMaterial, 
     moved = [
         {
             "POSITION": buffer.accessor(target[vertex], "VEC3", ARRAY_BUFFER, bounds=True),
-            "NORMAL": buffer.accessor(
-                _normal_change(template, target, mesh.faces)[vertex], "VEC3", ARRAY_BUFFER
-            ),
+            "NORMAL": buffer.accessor(change[vertex], "VEC3", ARRAY_BUFFER),
         }
-        for target in targets
+        for target, change in zip(targets, changes)
     ]
     return {
         "attributes": attributes,
@@ -243,18 +251,10 @@ def _primitive(buffer, mesh, template, targets, weight, material: GltfMaterial, 
     }
 
 
-def _normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    corner = vertices[faces]
-    face = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    normal = np.stack(
-        [np.bincount(faces.ravel(), np.repeat(face[:, k], 3), len(vertices)) for k in range(3)], 1
-    )
-    length = np.linalg.norm(normal, axis=1, keepdims=True)
-    return np.where(length > 0, normal / np.maximum(length, 1e-30), [0.0, 0.0, 1.0]).astype(np.float32)
-
-
-def _normal_change(template: np.ndarray, target: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    return _normals(template + target, faces) - _normals(template, faces)
+def _normals(mesh: TriangleMesh) -> np.ndarray:
+    """Vertex normals of unit length everywhere, as the format asks: +z where a mesh has none."""
+    normals = mesh.vertex_normals
+    return np.where(normals.any(1, keepdims=True), normals, [0.0, 0.0, 1.0]).astype(np.float32)
 
 
 def _material(buffer, material: GltfMaterial) -> dict:
