@@ -9,19 +9,32 @@ for VOCASET takes every second frame of files at 60 frames a second.
 """
 
 import pickle
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32
 
-from meshanim.audio import load_waveform, save_waveform
-from meshanim.datasets.meshanim_format import MotionSequence, SequenceInfo, Subject
+from meshanim.audio import Waveform, load_waveform, save_waveform
+from meshanim.datasets.motion_dataset import (
+    DatasetOptions,
+    MotionArrays,
+    MotionDataset,
+    MotionSequence,
+    SequenceInfo,
+    Subject,
+)
 from meshanim.errors import FileFormatError, OptionError
 from meshanim.files import written_whole
 from meshanim.unpickle import load_pickle
 
-__all__ = ["FaceFormerDataset", "write_faceformer_sequence", "write_faceformer_templates"]
+__all__ = [
+    "FaceFormerDataset",
+    "FaceFormerOptions",
+    "write_faceformer_sequence",
+    "write_faceformer_templates",
+]
 
 
 def write_faceformer_sequence(directory: str | Path, sequence: MotionSequence) -> None:
@@ -48,26 +61,36 @@ def write_faceformer_templates(directory: str | Path, subjects: Sequence[Subject
         temporary.write_bytes(written)
 
 
-class FaceFormerDataset:
+@dataclass(frozen=True)
+class FaceFormerOptions(DatasetOptions):
+    """What the folders do not say.
+
+    Parameters
+    ----------
+    fps : float
+        Frames a second of the files.
+    scale : float
+        Metres for one unit of the files.
+    """
+
+    fps: float = 30.0
+    scale: float = 1.0
+
+    def __post_init__(self):
+        super().__post_init__()
+        if not self.fps > 0 or not self.scale > 0:
+            raise OptionError(f"fps and scale must be positive, not {self.fps} and {self.scale}")
+
+
+class FaceFormerDataset(MotionDataset):
     """Reads the layout above.
 
     Parameters
     ----------
     directory : path
         With wav/, vertices_npy/ and templates.pkl.
-    fps : float
-        Frames a second of the files.
-    stride : int
-        Take every `stride`-th frame, as FaceFormer does with VOCASET (60 frames a second, stride 2).
-    scale : float
-        Metres for one unit of the files.
-
-    Attributes
-    ----------
-    templates : dict of (V, 3) arrays
-        By subject, metres.
-    sequences : tuple of str
-        Names.
+    options : FaceFormerOptions, optional
+        Rate, stride and unit.
 
     Raises
     ------
@@ -75,17 +98,23 @@ class FaceFormerDataset:
         If a part is missing or damaged.
     """
 
-    def __init__(self, directory: str | Path, fps: float = 30.0, stride: int = 1, scale: float = 1.0):
-        if not fps > 0 or stride < 1 or not scale > 0:
-            given = f"{fps}, {stride} and {scale}"
-            raise OptionError(f"fps and scale must be positive and stride at least 1, not {given}")
-        self.directory = Path(directory)
-        self.fps = fps / stride
-        self.stride = stride
-        self.scale = scale
-        self.templates = self._read_templates()
+    kind = "faceformer"
+    files = "vertices_npy/, wav/, templates.pkl"
+    Options = FaceFormerOptions
+
+    @classmethod
+    def detect(cls, directory: Path) -> bool:
+        """By vertices_npy/."""
+        return (directory / "vertices_npy").is_dir()
+
+    def __init__(self, directory: str | Path, options: FaceFormerOptions | None = None):
+        super().__init__(directory, options)
+        self.name = self.directory.name
+        self.fps = self.options.fps / self.options.stride
+        self.subjects = {name: Subject(name, value) for name, value in self._read_templates().items()}
+        self.splits = {}
         folder = self.directory / "vertices_npy"
-        self.sequences: tuple[str, ...] = tuple(
+        self.sequences = tuple(
             sorted(path.stem for path in folder.glob("*.npy") if not path.name.startswith("."))
         )
         if not self.sequences:
@@ -99,23 +128,11 @@ class FaceFormerDataset:
             for value in templates.values()
         ):
             raise FileFormatError(f"{path} holds no dictionary of (vertices, 3) arrays")
-        return {name: np.asarray(value * self.scale, np.float32) for name, value in templates.items()}
+        return {name: np.asarray(value * self.options.scale, np.float32) for name, value in templates.items()}
 
-    def __len__(self) -> int:
-        return len(self.sequences)
-
-    def __iter__(self) -> Iterator[MotionSequence]:
-        return (self[name] for name in self.sequences)
-
-    def __getitem__(self, key: int | str) -> MotionSequence:
-        """One sequence; pose is zero and curves are empty, the layout has neither.
-
-        Raises
-        ------
-        FileFormatError
-            If a file is missing, cut short, of another width than the template, or not finite.
-        """
-        name = self.sequences[key] if isinstance(key, int) else key
+    def _flat(self, name: str) -> np.ndarray:
+        """The array of a sequence, memory-mapped, its width checked."""
+        self._known(name)
         path = self.directory / "vertices_npy" / f"{name}.npy"
         try:
             flat = np.load(path, mmap_mode="r", allow_pickle=False)
@@ -123,21 +140,33 @@ class FaceFormerDataset:
             raise FileFormatError(f"cannot read {path}: {error.strerror or error}") from error
         except (ValueError, EOFError) as error:
             raise FileFormatError(f"{path} is damaged or cut short: {error}") from error
-        subject, _, sentence = name.rpartition("_")
-        if subject not in self.templates:
+        subject = name.rpartition("_")[0]
+        if subject not in self.subjects:
             raise FileFormatError(f"{path}: templates.pkl has no subject {subject!r}")
-        template = self.templates[subject]
+        template = self.subjects[subject].template
         if flat.ndim != 2 or flat.shape[1] != template.size:
             raise FileFormatError(f"{path} has shape {flat.shape}, expected (frames, {template.size})")
-        vertices = np.asarray(flat[:: self.stride], np.float32) * np.float32(self.scale)
-        if not np.isfinite(vertices).all():
-            raise FileFormatError(f"{path} holds values that are not finite")
-        frames = len(vertices)
+        return flat[:: self.options.stride]
+
+    def info(self, name: str) -> SequenceInfo:
+        """By the name and the header of the array."""
+        subject, _, sentence = name.rpartition("_")
         digits = sentence[-2:]
-        return MotionSequence(
-            SequenceInfo(subject, int(digits) if digits.isdigit() else 0, "", self.fps, frames),
-            vertices.reshape(frames, -1, 3),
-            np.zeros((frames, 3), np.float32),
-            np.zeros((frames, 0), np.float32),
-            load_waveform(self.directory / "wav" / f"{name}.wav"),
-        )
+        number = int(digits) if digits.isdigit() else 0
+        return SequenceInfo(subject, number, "", self.fps, len(self._flat(name)), name=name)
+
+    def motion(self, name: str) -> MotionArrays:
+        """Vertices, memory-mapped where they are float32 in the data set's unit."""
+        vertices = np.asanyarray(self._flat(name), np.float32)
+        if self.options.scale != 1:
+            vertices = vertices * np.float32(self.options.scale)
+        return MotionArrays(vertices.reshape(len(vertices), -1, 3))
+
+    def audio(self, name: str) -> Waveform:
+        """The sound of a sequence."""
+        return load_waveform(self.audio_file(name), rate=None)
+
+    def audio_file(self, name: str) -> Path:
+        """Its file."""
+        self._known(name)
+        return self.directory / "wav" / f"{name}.wav"

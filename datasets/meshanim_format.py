@@ -13,16 +13,23 @@ Frame i is at (i + 0.5) / fps seconds of the sound. Metres, radians, seconds.
 import json
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32
 
-from meshanim.audio import Phoneme, Waveform, load_waveform, save_waveform
-from meshanim.errors import FileFormatError, OptionError, ShapeError
+from meshanim.audio import Waveform, load_waveform, save_waveform
+from meshanim.datasets.motion_dataset import (
+    DatasetOptions,
+    MotionArrays,
+    MotionDataset,
+    MotionSequence,
+    SequenceInfo,
+    Subject,
+)
+from meshanim.errors import FileFormatError, ShapeError
 from meshanim.files import written_whole
 from meshanim.geometry import TriangleMesh
 
@@ -37,103 +44,6 @@ __all__ = [
 ]
 
 VERSION = 1
-
-
-@dataclass(frozen=True)
-class Subject:
-    """One person: a template mesh, and what is known about them.
-
-    Parameters
-    ----------
-    name : str
-        Letters, digits and underscores.
-    template : (V, 3) float32
-        Neutral vertices, metres.
-    shape : (S,) float32
-        Identity coefficients of the head; empty where unknown.
-    attributes : dict
-        Anything else that fits into JSON: speaking style, voice, ...
-    """
-
-    name: str
-    template: Float32[np.ndarray, "vertices 3"]
-    shape: Float32[np.ndarray, " shape"] = field(default_factory=lambda: np.zeros(0, np.float32))
-    attributes: Mapping[str, Any] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class SequenceInfo:
-    """What sequence.json holds.
-
-    Parameters
-    ----------
-    subject : str
-        Who speaks.
-    sentence : int
-        Number of the sentence, from 1 on; the same text for every subject.
-    text : str
-        What is said; empty where unknown.
-    fps : float
-        Frames a second.
-    frames : int
-        T.
-    phonemes : tuple of (start, end, symbol)
-        Seconds and ARPAbet; empty where unknown.
-    emotion : str
-        "neutral" or a name.
-    intensity : float
-        Of the emotion, 0 to 1.
-    voice : str
-        Who or what made the sound.
-    """
-
-    subject: str
-    sentence: int
-    text: str
-    fps: float
-    frames: int
-    phonemes: tuple[tuple[float, float, str], ...] = ()
-    emotion: str = "neutral"
-    intensity: float = 0.0
-    voice: str = ""
-
-    @property
-    def name(self) -> str:
-        """Name of the sequence's folder."""
-        return f"{self.subject}_sentence{self.sentence:02d}"
-
-
-@dataclass(frozen=True)
-class MotionSequence:
-    """One recorded or synthetic sentence.
-
-    Parameters
-    ----------
-    info : SequenceInfo
-        Subject, text, phonemes, emotion.
-    vertices : (T, V, 3) float32
-        Metres, zero pose; memory-mapped when read from disk.
-    pose : (T, 3) float32
-        Head rotation, axis-angle, radians, about the neck joint.
-    curves : (T, E) float32
-        Expression weights by the data set's `curve_names`; E is 0 where unknown.
-    audio : Waveform
-        The speech.
-    """
-
-    info: SequenceInfo
-    vertices: Float32[np.ndarray, "frames vertices 3"]
-    pose: Float32[np.ndarray, "frames 3"]
-    curves: Float32[np.ndarray, "frames curves"]
-    audio: Waveform
-
-    def __len__(self) -> int:
-        return self.info.frames
-
-    @property
-    def phonemes(self) -> list[Phoneme]:
-        """Timed phonemes; empty where unknown."""
-        return [Phoneme(*entry) for entry in self.info.phonemes]
 
 
 def write_sequence(directory: str | Path, sequence: MotionSequence) -> None:
@@ -263,7 +173,7 @@ def _read_array(path: Path, shape: tuple[int | None, ...], memory_map: bool) -> 
     return array
 
 
-class MeshanimDataset:
+class MeshanimDataset(MotionDataset):
     """Reads the layout at the top of this module.
 
     Opening reads the small files; vertices are memory-mapped when a sequence is taken. Length and iteration
@@ -295,8 +205,17 @@ class MeshanimDataset:
         If a file is missing, damaged, of another version, or contradicts another file.
     """
 
-    def __init__(self, directory: str | Path):
-        self.directory = Path(directory)
+    kind = "meshanim"
+    files = "dataset.json, sequences/"
+    mesh: TriangleMesh
+
+    @classmethod
+    def detect(cls, directory: Path) -> bool:
+        """By dataset.json and sequences/."""
+        return (directory / "dataset.json").is_file() and (directory / "sequences").is_dir()
+
+    def __init__(self, directory: str | Path, options: DatasetOptions | None = None):
+        super().__init__(directory, options)
         path = self.directory / "dataset.json"
         if not path.exists():
             raise FileFormatError(f"{self.directory} has no dataset.json: no data set, or one not finished")
@@ -306,22 +225,20 @@ class MeshanimDataset:
         if record["version"] != VERSION or record["units"] != "m":
             given = f"version {record['version']} in {record['units']}"
             raise FileFormatError(f"{path} is {given}, expected version {VERSION} in m")
-        self.name: str = record["name"]
-        self.fps: float = float(record["fps"])
-        self.head: str = record["head"]
-        self.curve_names: tuple[str, ...] = tuple(record["curve_names"])
+        self.name = record["name"]
+        self.fps = float(record["fps"])
+        self.head = record["head"]
+        self.curve_names = tuple(record["curve_names"])
         self.mesh = self._read_mesh()
-        self.subjects: dict[str, Subject] = {
+        self.subjects = {
             name: self._read_subject(name, attributes) for name, attributes in record["subjects"].items()
         }
         folder = self.directory / "sequences"
         found = folder.iterdir() if folder.is_dir() else ()
-        self.sequences: tuple[str, ...] = tuple(
+        self.sequences = tuple(
             sorted(entry.name for entry in found if entry.is_dir() and not entry.name.startswith("."))
         )
-        self.splits: dict[str, tuple[str, ...]] = {
-            split: tuple(names) for split, names in record["splits"].items()
-        }
+        self.splits = {split: tuple(names) for split, names in record["splits"].items()}
         present = set(self.sequences)
         for split, names in self.splits.items():
             missing = [name for name in names if name not in present]
@@ -356,27 +273,14 @@ class MeshanimDataset:
             raise FileFormatError(f"{path} is damaged or lacks one of {', '.join(keys)}: {error}") from error
         return arrays
 
-    def __len__(self) -> int:
-        return len(self.sequences)
-
-    def __iter__(self) -> Iterator[MotionSequence]:
-        return (self[name] for name in self.sequences)
-
-    def split(self, name: str) -> tuple[str, ...]:
-        """Sequence names of a split; OptionError lists the splits there are."""
-        if name not in self.splits:
-            raise OptionError(f"{self.directory} has no split {name!r}; there are {', '.join(self.splits)}")
-        return self.splits[name]
-
     def info(self, name: str) -> SequenceInfo:
         """What is known about a sequence, without its arrays."""
-        if name not in self.sequences:
-            raise OptionError(f"{self.directory} has no sequence {name!r}; there are {len(self.sequences)}")
+        self._known(name)
         path = self.directory / "sequences" / name / "sequence.json"
         keys = ["subject", "sentence", "text", "fps", "frames", "phonemes", "emotion", "intensity", "voice"]
         record = _read_json(path, keys)
         info = SequenceInfo(
-            **{key: record[key] for key in keys if key != "phonemes"},
+            **{key: record[key] for key in keys if key not in ("phonemes", "name")},
             phonemes=tuple((float(start), float(end), symbol) for start, end, symbol in record["phonemes"]),
         )
         if info.name != name or info.subject not in self.subjects:
@@ -387,15 +291,8 @@ class MeshanimDataset:
             raise FileFormatError(f"{path} has {info.fps} frames a second, the data set {self.fps}")
         return info
 
-    def __getitem__(self, key: int | str) -> MotionSequence:
-        """A sequence by name or position; vertices memory-mapped, shapes checked.
-
-        Raises
-        ------
-        FileFormatError
-            If a file is missing, cut short, or of another shape than the rest says.
-        """
-        name = self.sequences[key] if isinstance(key, int) else key
+    def motion(self, name: str) -> MotionArrays:
+        """Vertices memory-mapped, shapes checked."""
         info = self.info(name)
         folder = self.directory / "sequences" / name
         pose = _read_array(folder / "pose.npy", (info.frames, 3), memory_map=False)
@@ -406,31 +303,13 @@ class MeshanimDataset:
         vertices = _read_array(
             folder / "vertices.npy", (info.frames, self.mesh.n_vertices, 3), memory_map=True
         )
-        return MotionSequence(info, vertices, pose, curves, load_waveform(folder / "audio.wav"))
+        return MotionArrays(vertices, pose, curves)
 
-    def check(self) -> list[str]:
-        """Read everything; what is wrong, one line a fault, empty if all is well.
+    def audio(self, name: str) -> Waveform:
+        """The sound of a sequence."""
+        return load_waveform(self.audio_file(name), rate=None)
 
-        Beyond what opening a sequence checks: vertices that are not finite or farther than 1 m from the
-        template, and sound whose length is not that of the motion.
-        """
-        faults = []
-        for name in self.sequences:
-            try:
-                sequence = self[name]
-            except FileFormatError as error:
-                faults.append(str(error))
-                continue
-            path = self.directory / "sequences" / name
-            distance = np.abs(sequence.vertices - self.subjects[sequence.info.subject].template)
-            if not np.isfinite(distance).all():
-                faults.append(f"{path / 'vertices.npy'} holds values that are not finite")
-            elif distance.size and distance.max() > 1:
-                faults.append(
-                    f"{path / 'vertices.npy'} leaves its template by {distance.max():.3g} m: wrong unit?"
-                )
-            seconds = sequence.info.frames / self.fps
-            if abs(seconds - sequence.audio.duration) > 2 / self.fps:
-                lengths = f"{seconds:.2f} s of motion and {sequence.audio.duration:.2f} s of sound"
-                faults.append(f"{path} has {lengths}")
-        return faults
+    def audio_file(self, name: str) -> Path:
+        """Its file."""
+        self._known(name)
+        return self.directory / "sequences" / name / "audio.wav"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from meshanim.datasets import FaceFormerDataset, MeshanimDataset
+from meshanim.datasets import FaceFormerDataset, FaceFormerOptions, MeshanimDataset
 from meshanim.datasets.synthetic import CURVE_NAMES, EMOTIONS, SpeakingStyle, perform
 from meshanim.datasets.synthetic.articulation import holds, segments
 from meshanim.datasets.synthetic.corpus import SynthesizeOptions, cast, splits, synthesize, takes
@@ -188,7 +188,7 @@ def test_faceformer_layout_round_trip(corpus, tmp_path):
     made = synthesize(
         options_for(tmp_path / "ff", format="faceformer", subjects=1, sentences=1), progress=False
     )
-    read = FaceFormerDataset(made, fps=30.0)
+    read = FaceFormerDataset(made, FaceFormerOptions(fps=30.0))
     ours = MeshanimDataset(corpus)["S01_sentence01"]
     (sequence,) = read
     assert np.array_equal(sequence.vertices, ours.vertices)
@@ -201,7 +201,7 @@ def test_faceformer_layout_round_trip(corpus, tmp_path):
         templates = pickle.load(file, encoding="latin1")
     assert np.array_equal(templates["S01"], MeshanimDataset(corpus).subjects["S01"].template)
     assert b"numpy._core" not in (made / "templates.pkl").read_bytes()
-    halved = FaceFormerDataset(made, fps=60.0, stride=2)
+    halved = FaceFormerDataset(made, FaceFormerOptions(fps=60.0, stride=2))
     assert halved.fps == 30
     assert np.array_equal(halved[0].vertices, ours.vertices[::2])
 
