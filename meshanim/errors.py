@@ -4,6 +4,7 @@ __all__ = [
     "BackendError",
     "DependencyError",
     "FileFormatError",
+    "JobError",
     "MeshError",
     "MeshanimError",
     "OptionError",
@@ -33,6 +34,10 @@ class OptionError(MeshanimError):
 
 class BackendError(MeshanimError):
     """A backend was asked for that is not built or not on this machine."""
+
+
+class JobError(MeshanimError):
+    """Worker processes or machines were lost, and what they worked on could not be finished elsewhere."""
 
 
 class DependencyError(MeshanimError):

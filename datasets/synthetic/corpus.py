@@ -3,13 +3,9 @@
 import hashlib
 import json
 import math
-import multiprocessing
-import os
 import shutil
-from collections.abc import Iterator
-from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
-from dataclasses import asdict, dataclass
-from functools import lru_cache
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Literal
 
@@ -35,6 +31,7 @@ from meshanim.datasets.synthetic.style import EMOTIONS, SpeakingStyle
 from meshanim.errors import DependencyError, FileFormatError, OptionError
 from meshanim.files import written_whole
 from meshanim.heads import Head, HeadParameters, load_head
+from meshanim.jobs import run_jobs
 
 __all__ = ["CastMember", "SynthesizeOptions", "Take", "act", "cast", "splits", "synthesize", "takes"]
 
@@ -68,6 +65,8 @@ class SynthesizeOptions:
     """Sentences of your own, one a line, instead of the built-in ones."""
     workers: int = 0
     """Processes; 0 takes one a core."""
+    dask: str = ""
+    """Address of a Dask scheduler, such as tcp://host:8786, whose workers make the sequences instead."""
 
     def __post_init__(self):
         for name, low, high in (
@@ -84,9 +83,11 @@ class SynthesizeOptions:
 
     @property
     def recorded(self) -> dict[str, str | int | float]:
-        """What decides the content of the files: all options but the folder and the workers."""
+        """What decides the content of the files: all options but the folder and who works."""
         texts = hashlib.sha256("\n".join(_texts(self)).encode()).hexdigest()[:16]
-        chosen = {key: value for key, value in asdict(self).items() if key not in ("directory", "workers")}
+        chosen = {
+            key: value for key, value in asdict(self).items() if key not in ("directory", "workers", "dask")
+        }
         return {**chosen, "texts": texts, "version": __version__}
 
 
@@ -298,8 +299,10 @@ def _columns(head: Head) -> list[int]:
     return [CURVE_NAMES.index(name) if name in CURVE_NAMES else -1 for name in head.expression_names]
 
 
-def _make(take: Take, options: SynthesizeOptions) -> str:
+def _make(options: SynthesizeOptions, take: Take) -> str:
     """Make and write one sequence; one thread, so that sums do not depend on the machine."""
+    if _done(options, take):
+        return _name(take)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -361,28 +364,13 @@ def _claim(options: SynthesizeOptions) -> None:
             raise FileFormatError(f"cannot write {options.directory}: {error.strerror}") from error
         with written_whole(path) as temporary:
             temporary.write_text(json.dumps(options.recorded, indent=1) + "\n", encoding="utf-8")
+    _remove_half_written(options)
+
+
+def _remove_half_written(options: SynthesizeOptions) -> None:
     for folder in ("sequences", "wav", "vertices_npy"):
         for left in (options.directory / folder).glob(".*"):
             shutil.rmtree(left) if left.is_dir() else left.unlink()
-
-
-def _run(missing: list[Take], options: SynthesizeOptions) -> Iterator[str]:
-    """Make takes one by one or in processes; names come as they are finished."""
-    workers = min(options.workers or os.cpu_count() or 1, len(missing))
-    if workers <= 1:
-        for take in missing:
-            yield _make(take, options)
-        return
-    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
-        waiting = {pool.submit(_make, take, options) for take in missing}
-        try:
-            while waiting:
-                finished, waiting = wait(waiting, return_when=FIRST_EXCEPTION, timeout=0.5)
-                for future in finished:
-                    yield future.result()
-        finally:
-            for future in waiting:
-                future.cancel()
 
 
 def synthesize(options: SynthesizeOptions, progress: bool = True) -> Path:
@@ -419,8 +407,10 @@ def synthesize(options: SynthesizeOptions, progress: bool = True) -> Path:
     missing = [take for take in everything if not _done(options, take)]
     with tqdm(total=len(everything), initial=len(everything) - len(missing), disable=not progress) as bar:
         bar.set_description("sequences")
-        for _ in _run(missing, options):
+        make = partial(_make, replace(options, directory=options.directory.absolute()))
+        for _ in run_jobs(make, missing, options.workers, options.dask):
             bar.update()
+    _remove_half_written(options)  # by workers that were killed
     subjects = [_subject(head, member) for member in members]
     if options.format == "faceformer":
         write_faceformer_templates(options.directory, subjects)

@@ -2,8 +2,12 @@
 
 import hashlib
 import json
+import os
 import pickle
 import shutil
+import signal
+import threading
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -128,6 +132,28 @@ def test_lips_close_on_every_bilabial_of_every_face(head, fps):
 def test_the_number_of_workers_changes_nothing(corpus, tmp_path):
     parallel = synthesize(options_for(tmp_path / "parallel", workers=2), progress=False)
     assert fingerprint(parallel) == fingerprint(corpus)
+
+
+def test_a_cluster_that_loses_a_worker_makes_the_same_corpus(corpus, tmp_path):
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+    ) as cluster:
+        made = tmp_path / "cluster"
+        left_at_death = []
+
+        def kill_one():
+            while not list(made.glob("sequences/S*")):
+                time.sleep(0.01)
+            os.kill(cluster.workers[0].pid, signal.SIGKILL)
+            left_at_death.append(4 - len(list(made.glob("sequences/S*"))))
+
+        killer = threading.Thread(target=kill_one, daemon=True)
+        killer.start()
+        synthesize(options_for(made, dask=cluster.scheduler_address), progress=False)
+        killer.join(timeout=60)
+    assert left_at_death[0] > 0
+    assert fingerprint(made) == fingerprint(corpus)
 
 
 def test_another_seed_is_another_corpus(corpus, tmp_path):
