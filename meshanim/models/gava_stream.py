@@ -11,7 +11,7 @@ from torch import Tensor
 
 from meshanim.audio import feature_windows
 from meshanim.errors import OptionError, ShapeError
-from meshanim.motion.lip_seal import LipSeal
+from meshanim.motion.lip_seal import LipSeal, sealed_frames, sealed_steps
 
 if TYPE_CHECKING:
     from meshanim.models.gava import Gava
@@ -107,10 +107,10 @@ class GavaStream:
         self.computed = 0
         self.given = 0
         self.ended = False
-        # Frames not yet given, and the poses and posteriors before and after them that filters still read.
+        # Frames not yet given, and the poses and seals before and after them that filters still read.
         self.waiting: list[Tensor] = []
         self.poses: list[Tensor] = []
-        self.posteriors: list[Tensor] = []
+        self.seals: list[Tensor] = []
         self.context = 0
 
     @torch.inference_mode()
@@ -174,8 +174,11 @@ class GavaStream:
             self.waiting.append(self.template + out.displacements)
             self.poses.append(out.pose)
             if self.bilabial is not None:
-                middle = self.inputs[0].windows(self.fps, count, self.computed, width=1)
-                self.posteriors.append(middle[:, 0, self.bilabial])
+                track = self.inputs[0]
+                steps = sealed_steps(track.kept[:, self.bilabial])
+                self.seals.append(
+                    sealed_frames(steps, track.rate, self.fps, count, self.computed, track.offset)
+                )
             self.computed += count
             for entry in self.inputs:
                 entry.forget(self.fps, self.computed)
@@ -191,10 +194,10 @@ class GavaStream:
         poses = torch.cat(self.poses)
         pose = self._smoothed(poses)[self.context : self.context + count]
         if self.seal is not None:
-            posteriors = torch.cat(self.posteriors)
-            envelope = self.seal.envelope(posteriors, self.fps)[self.context : self.context + count]
+            seals = torch.cat(self.seals)
+            envelope = self.seal.envelope(seals, self.fps)[self.context : self.context + count]
             vertices = self.seal(vertices, envelope)
-            self.posteriors = [posteriors[max(0, self.context + count - self.look_ahead) :].clone()]
+            self.seals = [seals[max(0, self.context + count - self.look_ahead) :].clone()]
         self.poses = [poses[max(0, self.context + count - self.look_ahead) :].clone()]
         self.context = min(self.context + count, self.look_ahead)
         self.given += count
@@ -224,8 +227,8 @@ class _Input:
         self.kept = torch.cat([self.kept, array]) if len(self.kept) else array
 
     def _last(self, frame: int, fps: float) -> float:
-        """Position of the last entry of a frame's window, as `feature_windows` computes it."""
-        return (frame + 0.5) * (self.rate / fps) - 0.5 + (self.width - 1) / 2
+        """Position of the last entry of a frame's window, or of the frame itself where that is longer."""
+        return (frame + 0.5) * (self.rate / fps) - 0.5 + max(self.width - 1, self.rate / fps) / 2
 
     def ready(self, fps: float) -> int:
         """Frames whose windows are complete."""
@@ -234,14 +237,12 @@ class _Input:
             count -= 1
         return count
 
-    def windows(self, fps: float, frames: int, first: int, width: int | None = None) -> Tensor:
-        return feature_windows(
-            self.kept, self.rate, fps, frames, self.width if width is None else width, first, self.offset
-        )
+    def windows(self, fps: float, frames: int, first: int) -> Tensor:
+        return feature_windows(self.kept, self.rate, fps, frames, self.width, first, self.offset)
 
     def forget(self, fps: float, frame: int) -> None:
         """Drop what no window from `frame` on reads."""
-        first = math.floor(self._last(frame, fps)) - self.width
+        first = math.floor(self._last(frame, fps)) - max(self.width, math.ceil(self.rate / fps) + 2)
         # At least one is kept, whose value holds beyond the end.
         drop = min(first - self.offset, len(self.kept) - 1)
         if drop > 0:
