@@ -1,12 +1,12 @@
 """What `meshanim evaluate gava` measures: held-out motion, baselines, and speech of real people."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Int
+from jaxtyping import Float32, Int64
 from tqdm import tqdm
 
 from meshanim.audio import SpeechEncoder, Waveform, load_encoder, log_mel
@@ -14,20 +14,13 @@ from meshanim.audio.features import frame_count
 from meshanim.audio.viseme_evaluation import load_clips
 from meshanim.datasets.meshanim_format import MeshanimDataset, MotionSequence
 from meshanim.errors import OptionError
-from meshanim.heads import Head, load_head
+from meshanim.heads import load_head
 from meshanim.models.gava import Gava
 from meshanim.models.gava_stream import GavaStream, PoseSmoothing, animate
-from meshanim.motion.lip_seal import LipSeal, head_lip_pairs, head_lip_seal
-from meshanim.results import Results
-from meshanim.training.metrics import (
-    axis_dynamics_deviation,
-    bilabial_closure,
-    eye_vertex_error,
-    lip_aperture,
-    lip_vertex_error,
-    mean_vertex_error,
-    upper_face_dynamics_deviation,
-)
+from meshanim.motion.lip_seal import LipSeal, head_lip_seal
+from meshanim.results import MetricValue, Results
+from meshanim.training.metrics import aperture_extremes
+from meshanim.training.motion_evaluation import JITTER_ABOVE, MotionEvaluation, masks_of_head
 
 __all__ = ["EvaluateGavaOptions", "evaluate_gava"]
 
@@ -56,12 +49,14 @@ class EvaluateGavaOptions:
     """Splits of the data set."""
     human: Path | None = None
     """Folder of recorded speech, each file with NAME.txt that says what is spoken."""
+    jitter_above: float = JITTER_ABOVE
+    """Hz above which the power of the lips' acceleration counts as jitter."""
     json: Path | None = None
-    """Where to write the rows."""
+    """Where to write the rows, each sequence's numbers included, for meshanim evaluate compare."""
 
 
 def evaluate_gava(options: EvaluateGavaOptions, progress: bool = True) -> Results:
-    """Fill the table: lip, eye and mean vertex error, FDD, AFDD and the share of bilabials that close.
+    """Fill the table: every metric of docs/metrics.md that the head's regions allow, models before baselines.
 
     Raises
     ------
@@ -79,38 +74,36 @@ def evaluate_gava(options: EvaluateGavaOptions, progress: bool = True) -> Result
         models[describe(name, model)] = model
     head = load_head(dataset.head) if dataset.head else None
     still = mean_displacement(dataset)
-    methods: dict[str, Callable[[MotionSequence], Motion]] = {
-        "template held still": lambda s: np.repeat(
-            dataset.subjects[s.info.subject].template[None], len(s), 0
-        ),
-        "mean of training": lambda s: np.repeat(
-            (dataset.subjects[s.info.subject].template + still)[None], len(s), 0
-        ),
-    }
+    masks = masks_of_head(head)
+    methods: dict[str, Callable[[MotionSequence], Motion]] = {}
     for name, model in models.items():
         encoder = load_encoder(model.config.encoder)
         methods[name] = speaker(model, encoder, dataset, None)
         seal = head_lip_seal(head)
         if seal is not None and getattr(encoder, "bilabial", None) is not None:
             methods[f"{name} + lip seal"] = speaker(model, encoder, dataset, seal)
+    methods["mean of training"] = lambda s: np.repeat(
+        (dataset.subjects[s.info.subject].template + still)[None], len(s), 0
+    )
+    methods["template held still"] = lambda s: np.repeat(
+        dataset.subjects[s.info.subject].template[None], len(s), 0
+    )
     results = Results("evaluate gava")
     for split in options.splits:
         for name, predict in methods.items():
-            for metric, (value, unit) in measure(
-                dataset, head, split, predict, f"{split}: {name}", progress
-            ).items():
-                results.add(split, name, metric, value, unit)
-    pairs = head_lip_pairs(head)
-    if pairs is not None:
+            evaluation = MotionEvaluation(masks, dataset.fps, jitter_above=options.jitter_above)
+            for value in measure(dataset, split, predict, evaluation, f"{split}: {name}", progress):
+                results.add_measured(split, name, value)
+    if masks.lip_pairs is not None:
         rows = articulation(
             (
                 (s.vertices, s.phonemes, s.info.fps)
                 for s in map(dataset.__getitem__, dataset.split(options.splits[0]))
             ),
-            pairs,
+            masks.lip_pairs,
         )
-        for metric, value in rows.items():
-            results.add(options.splits[0], "truth", metric, value, "share")
+        for metric, share in rows.items():
+            results.add(options.splits[0], "truth", metric, share, "share")
         if options.human is not None:
             clips = load_clips(options.human)
             for name, model in models.items():
@@ -120,8 +113,8 @@ def evaluate_gava(options: EvaluateGavaOptions, progress: bool = True) -> Result
                         (spoken(model, encoder, clip.waveform, seal=seal), clip.phonemes, model.config.fps)
                         for clip in clips
                     )
-                    for metric, value in articulation(moved, pairs).items():
-                        results.add("human clips", label, metric, value, "share")
+                    for metric, share in articulation(moved, masks.lip_pairs).items():
+                        results.add("human clips", label, metric, share, "share")
     if options.json is not None:
         results.save(options.json)
     return results
@@ -198,49 +191,42 @@ def speaker(
 
 def measure(
     dataset: MeshanimDataset,
-    head: Head | None,
     split: str,
     predict: Callable[[MotionSequence], Motion],
+    evaluation: MotionEvaluation,
     label: str,
     progress: bool,
-) -> dict[str, tuple[float, str]]:
-    """Every metric that the regions allow: errors are means over frames, deviations means over sequences."""
-    regions: Mapping[str, np.ndarray] = {} if head is None else head.regions
-    eyes = np.union1d(regions.get("eyelids", []), regions.get("eyes", [])).astype(np.int64)
-    pairs = head_lip_pairs(head)
-    frames: list[int] = []
-    columns: dict[str, list[float]] = {}
-    closed: list[bool] = []
-    names = dataset.split(split)
-    for name in tqdm(names, desc=label, unit="clip", disable=not progress):
+) -> list[MetricValue]:
+    """Score a split sequence by sequence.
+
+    Parameters
+    ----------
+    dataset : MeshanimDataset
+        The truth.
+    split : str
+        Of the data set.
+    predict : function
+        A sequence to its vertices, as `speaker` gives it.
+    evaluation : MotionEvaluation
+        Fresh.
+    label : str
+        Of the progress bar.
+    progress : bool
+        Whether to show it.
+    """
+    for name in tqdm(dataset.split(split), desc=label, unit="clip", disable=not progress):
         sequence = dataset[name]
-        true, found = np.asarray(sequence.vertices), predict(sequence)
-        values = {"mean vertex error": mean_vertex_error(found, true)}
-        if len(regions.get("lips", [])):
-            values["lip vertex error"] = lip_vertex_error(found, true, regions["lips"])
-        if len(eyes):
-            values["eye vertex error"] = eye_vertex_error(found, true, eyes)
-        if len(regions.get("upper_face", [])):
-            upper = regions["upper_face"]
-            template = dataset.subjects[sequence.info.subject].template
-            values["FDD"] = upper_face_dynamics_deviation(found, true, template, upper)
-            values["AFDD"] = axis_dynamics_deviation(found, true, upper)
-        for metric, value in values.items():
-            columns.setdefault(metric, []).append(value)
-        frames.append(len(sequence))
-        if pairs is not None:
-            spans = [(p.start, p.end) for p in sequence.phonemes if p.symbol in BILABIALS]
-            closed += bilabial_closure(found, true, pairs, spans, sequence.info.fps)
-    rows = {}
-    for metric, column in columns.items():
-        weights = None if metric in ("FDD", "AFDD") else frames
-        rows[metric] = (float(np.average(np.array(column), weights=weights)), "mm")
-    if closed:
-        rows["bilabials closed"] = (float(np.mean(closed)), "share")
-    return rows
+        evaluation.add(
+            name,
+            torch.from_numpy(predict(sequence))[None],
+            torch.from_numpy(np.array(sequence.vertices)),
+            torch.from_numpy(dataset.subjects[sequence.info.subject].template),
+            [(p.start, p.end) for p in sequence.phonemes if p.symbol in BILABIALS],
+        )
+    return evaluation.values()
 
 
-def articulation(spoken_clips, pairs: Int[np.ndarray, "pairs 2"]) -> dict[str, float]:
+def articulation(spoken_clips, pairs: Int64[torch.Tensor, "pairs 2"]) -> dict[str, float]:
     """Share of bilabials with closed lips and of open vowels with an open mouth, by aperture alone.
 
     Parameters
@@ -253,17 +239,13 @@ def articulation(spoken_clips, pairs: Int[np.ndarray, "pairs 2"]) -> dict[str, f
     closed: list[bool] = []
     opened: list[bool] = []
     for vertices, phonemes, fps in spoken_clips:
-        aperture = lip_aperture(np.asarray(vertices), pairs)
-        closed += [low < CLOSED_BELOW for low, _ in _extremes(aperture, phonemes, BILABIALS, fps)]
-        opened += [high > OPEN_ABOVE for _, high in _extremes(aperture, phonemes, OPEN_VOWELS, fps)]
+        moved = torch.from_numpy(np.array(vertices))
+
+        def extremes(symbols: Sequence[str], moved=moved, phonemes=phonemes, fps=fps):
+            spans = [(p.start, p.end) for p in phonemes if p.symbol in symbols]
+            return aperture_extremes(moved, pairs, spans, fps)
+
+        closed += (extremes(BILABIALS)[0] < CLOSED_BELOW).tolist()
+        opened += (extremes(OPEN_VOWELS)[1] > OPEN_ABOVE).tolist()
     shares = {"bilabials with closed lips": closed, "open vowels with open mouth": opened}
     return {name: float(np.mean(values)) for name, values in shares.items() if values}
-
-
-def _extremes(aperture: np.ndarray, phonemes: Sequence, symbols: Sequence[str], fps: float):
-    for phoneme in phonemes:
-        if phoneme.symbol in symbols:
-            first = max(0, int(np.floor(phoneme.start * fps)) - 1)
-            part = aperture[first : int(np.ceil(phoneme.end * fps)) + 1]
-            if len(part):
-                yield float(part.min()), float(part.max())
