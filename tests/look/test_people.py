@@ -1,4 +1,5 @@
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from meshanim.render.look.person import skin_color
 
 def shape_of(head, person):
     if person.identity:
-        return head.person(person.identity)[0].numpy()
+        return person.identity_strength * head.person(person.identity)[0].numpy()
     return np.pad(person.shape, (0, len(head.shape_names) - len(person.shape)))
 
 
@@ -55,3 +56,15 @@ def test_people_are_made_whole(head, assets, name):
         assert np.allclose(strands.barycentric.sum(1), 1, atol=1e-5)
     moved = np.linalg.norm(appearance.template - head.mesh.vertices, axis=1)
     assert moved.max() > 0.003
+
+
+def test_half_the_identity_moves_the_head_half_as_far(head, assets):
+    person = replace(PEOPLE["bruno"], rest_expression={})
+    whole, half, none = (
+        make_appearance(head, replace(person, identity_strength=share), 256, assets).template
+        for share in (1.0, 0.5, 0.0)
+    )
+    assert np.allclose(half - none, 0.5 * (whole - none), atol=1e-6)
+    assert np.abs(none - head.mesh.vertices).max() < 1e-6
+    with pytest.raises(OptionError, match="identity_strength"):
+        replace(person, identity_strength=1.2)

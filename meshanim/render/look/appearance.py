@@ -10,10 +10,12 @@ from jaxtyping import Float
 from meshanim.errors import OptionError
 from meshanim.heads import DefaultHead, HeadParameters
 from meshanim.render.look.assets import LookAssets, look_assets
+from meshanim.render.look.ears import clear_ears
 from meshanim.render.look.eyes import Eye, make_eye, make_eye_material
 from meshanim.render.look.groom import skin_shade
 from meshanim.render.look.hair import grow_hair
 from meshanim.render.look.person import PersonParameters
+from meshanim.render.look.scalp import falls_over_ears
 from meshanim.render.look.skin import micro_detail, paint_skin, paint_tongue
 from meshanim.render.look.skin_image import sample_skin_image
 from meshanim.render.look.strands import Strands
@@ -121,6 +123,13 @@ def make_appearance(
         paint.skin[assets.atlas.active, :3] = sample_skin_image(skin_image, assets.makehuman_uv)
     paint_tongue(assets.tongue_atlas, person, paint)
     strands, shade = grow_hair(assets.ground, paint, assets.lashes, person)
+    if falls_over_ears(person.hair):
+        strands = tuple(
+            clear_ears(group, on_skin, assets.skin.faces, assets.ground.ears)
+            if group.kind == "hair"
+            else group
+            for group in strands
+        )
     sky = assets.sky
     if shade is not None:
         rest = assets.ground.vertices
@@ -158,7 +167,8 @@ def make_appearance(
 def _shape(head: DefaultHead, person: PersonParameters) -> Float[np.ndarray, " shape"]:
     """Shape coefficients, padded with zeros to the head's number."""
     if person.identity:
-        return head.person(person.identity)[0].numpy().astype(np.float32)
+        whole = head.person(person.identity)[0].numpy().astype(np.float32)
+        return whole * np.float32(person.identity_strength)
     shape = np.zeros(len(head.shape_names), np.float32)
     if len(person.shape) > len(shape):
         raise OptionError(f"person has {len(person.shape)} shape coefficients, the head {len(shape)}")

@@ -13,8 +13,19 @@ from meshanim.render.look.person import PersonParameters, srgb_to_linear
 from meshanim.render.look.strands import Strands, attach
 from meshanim.render.look.surface import Surface, vertex_normals
 
-__all__ = ["Ground", "HairShade", "hair_colors", "make_strands", "skin_shade", "strand_occlusion", "unit"]
+__all__ = [
+    "GREY",
+    "Ground",
+    "HairShade",
+    "hair_colors",
+    "make_strands",
+    "skin_shade",
+    "strand_occlusion",
+    "unit",
+]
 
+GREY = np.array([1.0, 0.94, 0.82])
+"""Tint of hair without pigment; keratin is yellowish, and the sky's light is blue."""
 VOXEL = 4.0
 """Edge of the cells that hair density is counted in, millimetres."""
 
@@ -102,7 +113,7 @@ def hair_colors(
     pigment = srgb_to_linear(person.hair_color if color is None else color) * darken
     colors = pigment * draws.uniform(0.72, 1.28, (count, 1)) * draws.uniform(0.94, 1.06, (count, 3))
     grey = draws.uniform(size=count) < person.hair_grey
-    colors[grey] = draws.uniform(0.16, 0.44, (grey.sum(), 1)) * np.array([1.0, 0.965, 0.90])
+    colors[grey] = draws.uniform(0.12, 0.62, (grey.sum(), 1)) * GREY
     return colors
 
 

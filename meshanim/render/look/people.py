@@ -5,10 +5,25 @@ from meshanim.render.look.person import PersonParameters
 
 __all__ = ["PEOPLE", "find_person"]
 
-# MakeHuman's neutral has stern lids and brows; these weights rest the face.
-_CALM = {"browInnerUp": 0.16, "eyeWideLeft": 0.06, "eyeWideRight": 0.06}
-_KIND = {**_CALM, "mouthSmileLeft": 0.14, "mouthSmileRight": 0.14}
-_FRESH = {**_KIND, "browInnerUp": 0.22, "browOuterUpLeft": 0.06, "browOuterUpRight": 0.06}
+
+def _both(**weights: float) -> dict[str, float]:
+    return {f"{name}{side}": weight for name, weight in weights.items() for side in ("Left", "Right")}
+
+
+# MakeHuman's neutral has stern lids and brows and drooping mouth corners; these weights rest the face.
+_CALM = _both(
+    mouthSmile=0.20, mouthFrown=-0.25, cheekSquint=0.10, eyeWide=0.10, browDown=-0.15, browOuterUp=0.08
+)
+_KIND = _both(
+    mouthSmile=0.28,
+    mouthDimple=0.08,
+    mouthFrown=-0.25,
+    cheekSquint=0.16,
+    eyeWide=0.12,
+    browDown=-0.20,
+    browOuterUp=0.12,
+)
+_FRESH = {**_KIND, "browInnerUp": 0.05, **_both(browOuterUp=0.18, eyeWide=0.10)}
 
 
 _TWELVE = (
@@ -16,6 +31,7 @@ _TWELVE = (
         name="Ana",
         seed=11,
         identity="ana",
+        identity_strength=0.6,
         rest_expression=_KIND,
         tone=0.12,
         undertone=0.2,
@@ -24,7 +40,7 @@ _TWELVE = (
         blush=0.55,
         freckles=0.35,
         lip_color=(0.69, 0.33, 0.33),
-        lip_amount=0.35,
+        lip_amount=0.3,
         hair="bob",
         hair_color=(0.44, 0.28, 0.16),
         hair_length=0.125,
@@ -37,6 +53,7 @@ _TWELVE = (
         name="Bruno",
         seed=22,
         identity="bruno",
+        identity_strength=0.75,
         rest_expression=_CALM,
         tone=0.30,
         undertone=0.3,
@@ -59,6 +76,7 @@ _TWELVE = (
         name="Chidi",
         seed=33,
         identity="chidi",
+        identity_strength=0.9,
         rest_expression=_KIND,
         tone=0.93,
         undertone=0.1,
@@ -80,6 +98,7 @@ _TWELVE = (
         name="Mei",
         seed=44,
         identity="mei",
+        identity_strength=0.75,
         rest_expression=_KIND,
         tone=0.24,
         undertone=0.9,
@@ -101,7 +120,8 @@ _TWELVE = (
         name="Priya",
         seed=55,
         identity="priya",
-        rest_expression=_KIND,
+        identity_strength=0.85,
+        rest_expression={**_KIND, **_both(eyeWide=-0.06)},
         tone=0.62,
         undertone=0.5,
         masculinity=0.05,
@@ -121,6 +141,7 @@ _TWELVE = (
         name="Finn",
         seed=66,
         identity="finn",
+        identity_strength=0.75,
         rest_expression=_FRESH,
         tone=0.06,
         undertone=-0.2,
@@ -143,11 +164,12 @@ _TWELVE = (
         name="Greta",
         seed=77,
         identity="greta",
-        rest_expression=_KIND,
+        identity_strength=0.65,
+        rest_expression={**_KIND, **_both(mouthSmile=0.45, mouthFrown=-0.45)},
         tone=0.10,
         undertone=-0.1,
         masculinity=0.2,
-        age=0.95,
+        age=0.85,
         blush=0.5,
         freckles=0.1,
         moles=9,
@@ -168,11 +190,12 @@ _TWELVE = (
         name="Henrik",
         seed=88,
         identity="henrik",
+        identity_strength=0.75,
         rest_expression=_CALM,
         tone=0.20,
         undertone=0.1,
         masculinity=1.0,
-        age=0.9,
+        age=0.8,
         blush=0.65,
         moles=8,
         oil=0.4,
@@ -193,6 +216,7 @@ _TWELVE = (
         name="Imani",
         seed=99,
         identity="imani",
+        identity_strength=0.85,
         rest_expression=_FRESH,
         tone=0.82,
         undertone=0.4,
@@ -214,6 +238,7 @@ _TWELVE = (
         name="Jun",
         seed=110,
         identity="jun",
+        identity_strength=0.8,
         rest_expression=_CALM,
         tone=0.33,
         undertone=0.8,
@@ -235,6 +260,7 @@ _TWELVE = (
         name="Kavi",
         seed=121,
         identity="kavi",
+        identity_strength=0.9,
         rest_expression=_KIND,
         tone=0.55,
         undertone=0.5,
@@ -256,6 +282,7 @@ _TWELVE = (
         name="Lena",
         seed=132,
         identity="lena",
+        identity_strength=0.85,
         rest_expression=_FRESH,
         tone=0.05,
         undertone=0.0,

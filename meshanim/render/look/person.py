@@ -18,7 +18,7 @@ EYE_COLORS: dict[str, tuple[Color, Color]] = {
     "dark": ((0.204, 0.118, 0.071), (0.110, 0.063, 0.039)),
     "hazel": ((0.502, 0.384, 0.188), (0.306, 0.329, 0.196)),
     "green": ((0.471, 0.455, 0.259), (0.329, 0.392, 0.306)),
-    "blue": ((0.502, 0.620, 0.714), (0.275, 0.416, 0.573)),
+    "blue": ((0.455, 0.545, 0.612), (0.345, 0.447, 0.541)),
     "grey": ((0.588, 0.620, 0.627), (0.376, 0.424, 0.455)),
 }
 
@@ -31,6 +31,7 @@ _TONE_SRGB = np.array(
 )
 
 _RANGES: dict[str, tuple[float, float]] = {
+    "identity_strength": (0.0, 1.0),
     "tone": (0.0, 1.0),
     "undertone": (-1.0, 1.0),
     "blush": (0.0, 1.0),
@@ -67,6 +68,8 @@ class PersonParameters:
         Draws pores, veins, strands, freckles, teeth: the same seed gives the same arrays bit by bit.
     identity : str
         A named identity of the default head; empty for the mean shape (`shape` is then used as given).
+    identity_strength : float
+        How far from the mean head towards the named identity, 0 to 1.
     shape : tuple of float
         Shape coefficients of the default head, used where `identity` is empty; missing ones are zero.
     rest_expression : mapping of str to float
@@ -126,6 +129,7 @@ class PersonParameters:
     name: str = ""
     seed: int = 0
     identity: str = ""
+    identity_strength: float = 1.0
     shape: tuple[float, ...] = ()
     rest_expression: Mapping[str, float] = field(default_factory=dict)
     tone: float = 0.25

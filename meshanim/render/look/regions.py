@@ -22,10 +22,10 @@ def hairline(points: Points, baldness: float = 0.0, sideburns: float = 0.5) -> M
     points : (n, 3) float
         Paint space, millimetres.
     baldness, sideburns : float
-        0 to 1: recession of the arc; width and length of the sideburns.
+        0 to 1: recession of the arc; width and length of the sideburns and depth of the temples.
     """
     x, y, z = np.abs(points[:, 0]), points[:, 1], points[:, 2]
-    arc = 95 - 0.2 * x + 10 * np.exp(-(((x - 45) / 12) ** 2))
+    arc = 95 - 0.2 * x + (4 + 6 * sideburns) * np.exp(-(((x - 45) / (18 - 6 * sideburns)) ** 2))
     arc = arc + baldness * (20 + 30 * np.exp(-((x / 30) ** 2)))
     top = np.minimum(y - arc - 0.1 * np.clip(z - 22, 0, None), 3 * (28 - z) + 50)
     side = np.minimum(0.9 * (-z - 8) + 0.25 * (y - 50), y - 22)

@@ -8,16 +8,16 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from meshanim.render.look.groom import Ground, HairShade, hair_colors, make_strands, strand_occlusion, unit
-from meshanim.render.look.paint import blob, smoothstep
+from meshanim.render.look.noise import value_noise
+from meshanim.render.look.paint import smoothstep
 from meshanim.render.look.person import PersonParameters
 from meshanim.render.look.regions import hairline
 from meshanim.render.look.strands import Strands
 
-__all__ = ["scalp_hair"]
+__all__ = ["falls_over_ears", "scalp_hair"]
 
 WHORL = np.array([4.0, 145.0, -80.0])
 BUN = np.array([0.0, 158.0, -104.0])
-EAR = ((78, 14, -22), (16, 26, 20))
 
 Points = Float[np.ndarray, "strands 3"]
 
@@ -26,7 +26,8 @@ Points = Float[np.ndarray, "strands 3"]
 class _Style:
     """How one style is traced. Lengths in millimetres.
 
-    `flow(points, roots, person)` is the direction hair wants to take; `length(roots, person)` how long it is.
+    `flow(points, roots, person)` is the direction hair wants to take; `length(roots, person)` how long it is,
+    times a draw from `spread`. Hair lies flat beside a parting where the style has one.
     """
 
     flow: Callable[[np.ndarray, np.ndarray, PersonParameters], np.ndarray]
@@ -41,7 +42,9 @@ class _Style:
     frizz: float
     width: float
     curl: float = 0.0
-    over_ears: float = 0.0
+    over_ears: bool = False
+    has_parting: bool = False
+    spread: tuple[float, float] = (0.72, 1.06)
 
 
 def _blend(first: np.ndarray, second: np.ndarray, share: np.ndarray) -> np.ndarray:
@@ -101,7 +104,7 @@ def _hanging(points: Points, roots: Points, person: PersonParameters) -> Points:
 
 def _in_fringe(roots: Points, person: PersonParameters) -> np.ndarray:
     """Which strands fall over the forehead: an even draw from the front, fixed by the root's place."""
-    front = (np.abs(roots[:, 0]) < 44) & (roots[:, 2] > -30) & (roots[:, 1] > 90)
+    front = (np.abs(roots[:, 0]) < 46) & (roots[:, 2] > -30) & (roots[:, 1] > 90)
     lot = np.modf(np.abs(np.sin(roots @ np.array([12.9898, 78.233, 37.719])) * 43758.5453))[0]
     return front & (lot < person.fringe)
 
@@ -130,7 +133,7 @@ def _to_one_level(roots: Points, person: PersonParameters) -> np.ndarray:
     over = np.where(roots[:, 1] > 60, 95 * (np.pi / 2 - np.arcsin(np.clip(reach, 0, 1))), 0)
     level = 60 - person.hair_length * 1000
     length = np.clip(over + np.minimum(roots[:, 1], 60) - level, 30, 400)
-    brows = np.clip(44 + 1.1 * (60 - np.minimum(roots[:, 2], 60)), 40, 150)
+    brows = np.clip(47 + 1.1 * (60 - np.minimum(roots[:, 2], 60)), 40, 150)
     return np.where(_in_fringe(roots, person), brows, length)
 
 
@@ -145,12 +148,35 @@ def _even(roots: Points, person: PersonParameters) -> np.ndarray:
 _STYLES = {
     "buzz": _Style(_cropped, _even, 30000, 2, 0.55, 0.0, 0.1, 0, 0.0, 0.0, 0.16),
     "crop": _Style(_cropped, _short_sides, 20000, 5, 0.55, 6.0, 0.25, 700, 0.45, 0.9, 0.16),
-    "parted": _Style(_parted, _short_sides, 16000, 8, 0.40, 7.0, 0.15, 420, 0.6, 1.0, 0.17),
+    "parted": _Style(_parted, _short_sides, 16000, 8, 0.40, 7.0, 0.15, 420, 0.6, 1.0, 0.21, has_parting=True),
     "curls": _Style(_outwards, _even, 15000, 15, 0.6, 2.0, 0.05, 1800, 0.45, 2.5, 0.26, 3.8),
-    "bob": _Style(_hanging, _to_one_level, 14000, 12, 0.35, 9.0, 0.2, 330, 0.6, 2.0, 0.20, 0.0, 12.0),
-    "long": _Style(_hanging, _to_one_level, 14000, 14, 0.35, 9.0, 0.25, 260, 0.65, 3.0, 0.20, 0.0, 12.0),
-    "bun": _Style(_tied, _to_knot, 13000, 9, 0.25, 3.0, 0.0, 500, 0.3, 0.6, 0.19, 0.0, 4.0),
+    "bob": _Style(
+        _hanging, _to_one_level, 12500, 12, 0.30, 9.0, 0.2, 330, 0.6, 1.4, 0.35, 0.0, True, True, (0.90, 1.02)
+    ),
+    "long": _Style(
+        _hanging,
+        _to_one_level,
+        14000,
+        14,
+        0.30,
+        9.0,
+        0.25,
+        260,
+        0.65,
+        2.4,
+        0.32,
+        0.0,
+        True,
+        True,
+        (0.88, 1.04),
+    ),
+    "bun": _Style(_tied, _to_knot, 13000, 9, 0.25, 3.0, 0.0, 500, 0.3, 0.6, 0.24),
 }
+
+
+def falls_over_ears(style: str) -> bool:
+    """Whether hair of a style (one of `HAIR_STYLES`) hangs over the ears."""
+    return style in _STYLES and _STYLES[style].over_ears
 
 
 def scalp_hair(
@@ -172,9 +198,10 @@ def scalp_hair(
     if person.hair == "none" or scalp.max() <= 0:
         return [], None
     style = _STYLES[person.hair]
-    texels = ground.sample(np.where(scalp > 0.15, scalp, 0), style.count, draws)
+    sparse = 0.45 if style.over_ears else 0.15  # single long hairs below the hairline look like scratches
+    texels = ground.sample(np.where(scalp > sparse, scalp, 0), style.count, draws)
     roots = ground.points[texels].astype(float)
-    length = style.length(roots, person) * draws.uniform(0.72, 1.06, len(roots))
+    length = style.length(roots, person) * draws.uniform(*style.spread, len(roots))
     edge = hairline(roots, person.baldness, person.masculinity)
     if person.hair != "bun":
         thin = (0.45 + 0.55 * smoothstep(-3, 9, edge)) * ~_in_fringe(roots, person)
@@ -194,11 +221,10 @@ def scalp_hair(
     occlusion, shade = _shade(groups, style.width)
     strands = []
     for (texel, path, normal), light in zip(groups, occlusion):
-        colors = hair_colors(person, len(texel), draws)
+        colors = hair_colors(person, len(texel), draws) * _lock_tint(path[:, 0], person)
+        width = style.width * 1e-3 * np.where(_in_fringe(path[:, 0], person), 1.9, 1.0)
         strands.append(
-            make_strands(
-                "hair", ground, texel, path[:, 1:] - path[:, :1], normal, light, style.width * 1e-3, colors
-            )
+            make_strands("hair", ground, texel, path[:, 1:] - path[:, :1], normal, light, width, colors)
         )
     return strands, shade
 
@@ -218,19 +244,22 @@ def _trace(
     flow = style.flow(roots, roots, person)
     tangent = unit(flow - root_normals * (flow * root_normals).sum(1, keepdims=True))
     tangent = unit(tangent + draws.normal(0, 0.16, roots.shape))
-    direction = unit(style.lift * root_normals + (1 - style.lift) * tangent)
+    rise = _rise(roots, person) if style.has_parting else np.ones(len(roots))
+    lift = (style.lift * rise)[:, None]
+    direction = unit(lift * root_normals + (1 - lift) * tangent)
     points, normals = [roots], [root_normals.astype(float)]
     here = roots
     for index in range(style.steps):
         moved = here + direction * step
         normal, height = ground.nearest(moved)
         along = (index + 1) / style.steps
-        hover = 0.4 + style.volume * layer * min(1.0, 2.5 * along)
-        hover = hover + style.over_ears * blob(moved, *EAR) * layer**0.5
+        settled = np.maximum(rise, smoothstep(0, 70, np.linalg.norm(moved - roots, axis=1)))
+        hover = 0.4 + style.volume * layer * min(1.0, 2.5 * along) * settled
         moved = moved + normal * np.clip(hover - height, 0, None)[:, None]
         excess = np.clip(height - hover - 0.5, 0, None)
         if style.curl == 0:
-            moved = moved - normal * (0.35 * np.minimum(excess, 6))[:, None]
+            pull = 0.35 + 0.45 * (1 - settled)
+            moved = moved - normal * (pull * np.minimum(excess, 6 + 6 * (1 - settled)))[:, None]
         direction = unit(moved - here)
         wanted = style.flow(moved, roots, person)
         close = smoothstep(25, 5, height)[:, None]
@@ -242,6 +271,11 @@ def _trace(
     return np.stack(points, axis=1), np.stack(normals, axis=1)
 
 
+def _rise(roots: Points, person: PersonParameters) -> np.ndarray:
+    """How far hair may stand off the head: little beside the parting, where it is combed flat."""
+    return 0.22 + 0.78 * smoothstep(0, 60, np.abs(roots[:, 0] - person.part_side * 1000))
+
+
 def _gather(points: np.ndarray, apart: np.ndarray, style: _Style, draws: np.random.Generator) -> np.ndarray:
     """Pull every strand towards the leader of its lock, more so towards the tip."""
     leaders = draws.choice(len(points), min(style.locks, len(points)), replace=False)
@@ -251,7 +285,8 @@ def _gather(points: np.ndarray, apart: np.ndarray, style: _Style, draws: np.rand
     own = points - points[:, :1]
     led = points[lock] - points[lock, :1]
     start = points[:, :1] - points[lock, :1]
-    share = style.gather * along * draws.uniform(0.6, 1.2, (len(points), 1, 1)).clip(max=1)
+    loose = np.where(apart > 0, 0.3, 1.0)[:, None, None]  # a fringe hangs evenly
+    share = style.gather * along * loose * draws.uniform(0.6, 1.2, (len(points), 1, 1)).clip(max=1)
     target = (
         points[lock, :1]
         + start * (1 - 0.75 * along)
@@ -312,6 +347,12 @@ def _knot(ground: Ground, texels: np.ndarray, draws: np.random.Generator):
     points[:, 0] = ground.points[carrier]
     points[:, 1] = points[:, 2] - 0.2 * (points[:, 3] - points[:, 2])
     return carrier, points, unit(offset)
+
+
+def _lock_tint(roots: Points, person: PersonParameters) -> np.ndarray:
+    """A factor (n, 1) on the colour: neighbouring locks are a little lighter or darker."""
+    noise = value_noise(roots.astype(np.float32), 7.0, person.seed * 64 + 20, 2)
+    return np.exp(0.22 * noise)[:, None]
 
 
 def _shade(groups, width: float):

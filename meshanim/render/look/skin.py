@@ -8,6 +8,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 
 from meshanim.render.look.atlas import Atlas
+from meshanim.render.look.groom import GREY
 from meshanim.render.look.noise import value_noise
 from meshanim.render.look.paint import blob, smoothstep
 from meshanim.render.look.person import PersonParameters, skin_color, srgb_to_linear
@@ -204,9 +205,8 @@ def _distribution(density: np.ndarray) -> np.ndarray:
 def _lips(canvas: _Canvas, albedo: np.ndarray, lines: np.ndarray) -> np.ndarray:
     """Lips over the mouth's lining, which darkens towards the throat."""
     person = canvas.person
-    natural = canvas.base * (
-        np.array([0.82, 0.52, 0.50]) * canvas.fair + np.array([0.94, 0.70, 0.72]) * person.tone
-    )
+    tint = np.array([0.82, 0.52, 0.50]) * canvas.fair + np.array([0.94, 0.70, 0.72]) * person.tone
+    natural = canvas.base * (1 - (1 - tint) * (1 - 0.35 * person.masculinity))
     color = natural * (1 - person.lip_amount) + srgb_to_linear(person.lip_color) * person.lip_amount
     upper = smoothstep(-42, -38, canvas.y)
     shade = (1 + 0.12 * lines + 0.12 * canvas.fine + 0.10 * canvas.blotch) * (1 - 0.10 * upper)
@@ -255,8 +255,9 @@ def _hair_shadow(canvas: _Canvas, albedo: np.ndarray) -> tuple[np.ndarray, np.nd
     scalp = smoothstep(-6, 10, edge) * canvas.outer * (1 - ears) * has_hair
     if has_hair:
         scalp = scalp * _away_from_ears(canvas)
-    under = (0.86 if person.hair == "buzz" else 0.95) * scalp[:, None]
-    albedo = albedo * (1 - under) + (0.40 * hair + 0.05 * base) * under
+    cover, skin_share = (0.86, 0.05) if person.hair == "buzz" else (0.95, 0.012)
+    under = cover * scalp[:, None]
+    albedo = albedo * (1 - under) + (0.40 * hair + skin_share * base) * under
 
     brow = _brow_shadow(canvas)[:, None]
     brow_color = srgb_to_linear(person.brow_color) if person.brow_color else hair
@@ -274,7 +275,7 @@ def _hair_shadow(canvas: _Canvas, albedo: np.ndarray) -> tuple[np.ndarray, np.nd
 def _grown(person: PersonParameters) -> np.ndarray:
     """Mean linear colour of the hair, grey strands included."""
     pigment = srgb_to_linear(person.hair_color)
-    return (pigment * (1 - person.hair_grey) + 0.26 * person.hair_grey).astype(np.float32)
+    return (pigment * (1 - person.hair_grey) + 0.26 * GREY * person.hair_grey).astype(np.float32)
 
 
 def _away_from_ears(canvas: _Canvas) -> np.ndarray:
