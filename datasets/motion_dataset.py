@@ -36,6 +36,10 @@ __all__ = [
 LOADERS = {
     "meshanim": "meshanim_format:MeshanimDataset",
     "faceformer": "faceformer:FaceFormerDataset",
+    "multiface": "multiface:MultifaceDataset",
+    "mead": "mead:MeadDataset",
+    "unitalker": "unitalker:UniTalkerDataset",
+    "diffposetalk": "diffposetalk:DiffPoseTalkDataset",
 }
 
 
@@ -205,8 +209,8 @@ class MotionDataset(ABC):
         What `meshanim.heads.load_head` understands, or "".
     curve_names : tuple of str
         Columns of the curves.
-    subjects : dict of Subject
-        In the published order.
+    subjects : mapping of Subject
+        By name, in the published order.
     sequences : tuple of str
         All names.
     splits : dict of tuple of str
@@ -225,7 +229,7 @@ class MotionDataset(ABC):
     mesh: TriangleMesh | None = None
     head: str = ""
     curve_names: tuple[str, ...] = ()
-    subjects: dict[str, Subject]
+    subjects: Mapping[str, Subject]
     sequences: tuple[str, ...]
     splits: dict[str, tuple[str, ...]]
 

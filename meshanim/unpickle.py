@@ -17,7 +17,7 @@ import torch
 
 from meshanim.errors import FileFormatError
 
-__all__ = ["load_npy_objects", "load_pickle"]
+__all__ = ["load_npy_objects", "load_pickle", "load_pickled_bytes"]
 
 # What damaged or foreign bytes raise while they are unpickled.
 DAMAGED = (
@@ -134,12 +134,12 @@ def _plain(value: Any) -> Any:
     return np.asarray(state["x"]) if isinstance(state.get("x"), np.ndarray) else value
 
 
-def _load(stream, path: Path) -> Any:
+def _load(stream, where: str | Path) -> Any:
     try:
         return _plain(_ArrayUnpickler(stream, encoding="latin1").load())
     except DAMAGED as error:
         reason = str(error) or type(error).__name__
-        raise FileFormatError(f"{path} is not a whole pickle of arrays: {reason}") from error
+        raise FileFormatError(f"{where} is not a whole pickle of arrays: {reason}") from error
 
 
 def load_pickle(path: str | Path) -> Any:
@@ -158,6 +158,24 @@ def load_pickle(path: str | Path) -> Any:
         raise FileFormatError(f"{path} does not exist")
     with path.open("rb") as stream:
         return _load(stream, path)
+
+
+def load_pickled_bytes(content: bytes, where: str) -> Any:
+    """Read a pickle that lies inside another file, by the same rules as `load_pickle`.
+
+    Parameters
+    ----------
+    content : bytes
+        The pickle.
+    where : str
+        File and place in it, for the error.
+
+    Raises
+    ------
+    FileFormatError
+        If it is truncated, or names anything but arrays.
+    """
+    return _load(io.BytesIO(content), where)
 
 
 def load_npy_objects(path: str | Path) -> Any:

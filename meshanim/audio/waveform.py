@@ -12,6 +12,8 @@ from meshanim.files import written_whole
 
 __all__ = ["Waveform", "load_waveform", "save_waveform"]
 
+CONTAINERS = (".m4a", ".mp4")
+
 
 @dataclass(frozen=True)
 class Waveform:
@@ -85,7 +87,7 @@ def load_waveform(path: str | Path, rate: int | None = 16000) -> Waveform:
     Parameters
     ----------
     path : str or Path
-        Any format libsndfile reads: wav, flac, ogg, opus, mp3, aiff, ...
+        Any format libsndfile reads: wav, flac, ogg, opus, mp3, aiff, ...; .m4a and .mp4 by FFmpeg (PyAV).
     rate : int, optional
         Samples a second of the result; None keeps the file's.
 
@@ -104,7 +106,10 @@ def load_waveform(path: str | Path, rate: int | None = 16000) -> Waveform:
             f"{path} is not a file; expected a sound file (wav, flac, ogg, mp3): check the path"
         )
     try:
-        samples, file_rate = soundfile.read(path, dtype="float32", always_2d=True)
+        if path.suffix.lower() in CONTAINERS:
+            samples, file_rate = _decode(path)
+        else:
+            samples, file_rate = soundfile.read(path, dtype="float32", always_2d=True)
     except (soundfile.LibsndfileError, OSError) as error:
         reason = str(getattr(error, "error_string", error)).strip().rstrip(".")
         raise FileFormatError(
@@ -117,6 +122,28 @@ def load_waveform(path: str | Path, rate: int | None = 16000) -> Waveform:
     except ShapeError as error:
         raise ShapeError(f"{path}: {error}") from error
     return waveform if rate is None else waveform.resampled(rate)
+
+
+def _decode(path: Path) -> tuple[np.ndarray, int]:
+    """Samples (T, channels) and rate of the first sound of a container; OSError if there is none."""
+    import av
+
+    try:
+        with av.open(str(path)) as file:
+            if not file.streams.audio:
+                raise OSError("it has no sound")
+            stream = file.streams.audio[0]
+            resampler = av.AudioResampler(format="fltp")
+            blocks = [
+                block.to_ndarray()
+                for frame in (*file.decode(stream), None)
+                for block in resampler.resample(frame)
+            ]
+            rate = stream.rate
+    except av.FFmpegError as error:
+        raise OSError(error.strerror) from error
+    samples = np.concatenate(blocks, axis=1) if blocks else np.zeros((1, 0), np.float32)
+    return samples.T, int(rate)
 
 
 def save_waveform(waveform: Waveform, path: str | Path) -> None:
