@@ -67,6 +67,8 @@ def _digest_of_motion(arrays: MotionArrays) -> str:
     digest = hashlib.blake2b(digest_size=16)
     for first in range(0, len(arrays.vertices), CHUNK):
         digest.update(np.ascontiguousarray(arrays.vertices[first : first + CHUNK]).tobytes())
+    if arrays.curves is not None:
+        digest.update(np.ascontiguousarray(arrays.curves).tobytes())
     for key in sorted(arrays.coefficients):
         digest.update(np.ascontiguousarray(arrays.coefficients[key]).tobytes())
     return digest.hexdigest()

@@ -29,11 +29,10 @@ from meshanim.audio import Waveform
 from meshanim.datasets.flame_coefficients import (
     CoefficientOptions,
     LateSubjects,
-    flame_template,
     flame_vertices,
     optional_head,
 )
-from meshanim.datasets.motion_dataset import MotionArrays, MotionDataset, SequenceInfo, Subject
+from meshanim.datasets.motion_dataset import MotionArrays, MotionDataset, SequenceInfo
 from meshanim.errors import DependencyError, FileFormatError
 from meshanim.unpickle import load_pickled_bytes
 
@@ -50,7 +49,8 @@ class DiffPoseTalkDataset(MotionDataset):
     """Reads the layout above; clips of a video are joined into one sequence, named PERSON_VIDEO.
 
     Coefficients: `shape` (T, 100), `expression` (T, 50), `jaw` (T, 3). A subject's shape is the mean over the
-    first clip of their first video. Values are unpickled by `meshanim.unpickle`, which knows arrays alone.
+    first clip of their first video that can be read. Values are unpickled by `meshanim.unpickle`, which knows
+    arrays alone.
 
     Parameters
     ----------
@@ -89,10 +89,11 @@ class DiffPoseTalkDataset(MotionDataset):
             raise FileFormatError(f"{self._folder / 'data.mdb'} has no key PERSON/VIDEO/metadata")
         self._keys = {key.replace("/", "_"): key for key in sorted(self._clips)}
         self.sequences = tuple(self._keys)
-        self._first: dict[str, str] = {}
-        for key in self._keys.values():
-            self._first.setdefault(_person(key), key)
-        self.subjects = LateSubjects(tuple(self._first), self._subject)
+        self.subjects = LateSubjects(
+            self._head,
+            [(_person(key), name) for name, key in self._keys.items()],
+            self._first_shape,
+        )
         self.splits = {
             split: tuple(line.replace("/", "_") for line in _lines(path))
             for split in SPLITS
@@ -162,20 +163,19 @@ class DiffPoseTalkDataset(MotionDataset):
         value = self._value(key)
         if not isinstance(value, dict) or not isinstance(value.get("coef"), dict) or "audio" not in value:
             raise FileFormatError(f"{where} is no clip: expected a dictionary of coef and audio")
+        if not isinstance(value["audio"], bytes):
+            given = type(value["audio"]).__name__
+            raise FileFormatError(f"{where}: audio is {given}, expected a flac file's bytes")
         arrays = {}
         for name, width in WIDTHS.items():
             array = np.asarray(value["coef"].get(name))
             if array.dtype.kind != "f" or array.shape != (length, width):
-                raise FileFormatError(
-                    f"{where}: {name} has shape {array.shape}, expected ({length}, {width})"
-                )
+                raise FileFormatError(f"{where}: {name} has shape {array.shape}, not ({length}, {width})")
             arrays[name] = array.astype(np.float32)
         return arrays, value["audio"]
 
-    def _subject(self, person: str) -> Subject:
-        key = self._first[person]
-        shape = next(self._read_clips(key))[0]["shape"].mean(0)
-        return Subject(person, flame_template(self._head, shape), shape)
+    def _first_shape(self, name: str) -> Float32[np.ndarray, "frames shape"]:
+        return next(self._read_clips(self._keys[name]))[0]["shape"]
 
     def info(self, name: str) -> SequenceInfo:
         """By the video's metadata."""
@@ -269,11 +269,7 @@ def _lines(path: Path) -> list[str]:
     return [words[0] for line in path.read_text(encoding="utf-8").splitlines() if (words := line.split())]
 
 
-def _decode(content: Any, where: str) -> Float32[np.ndarray, " samples"]:
-    if not isinstance(content, bytes):
-        raise FileFormatError(
-            f"{where}: audio is {type(content).__name__}, expected the bytes of a flac file"
-        )
+def _decode(content: bytes, where: str) -> Float32[np.ndarray, " samples"]:
     try:
         samples, rate = soundfile.read(io.BytesIO(content), dtype="float32", always_2d=True)
     except soundfile.LibsndfileError as error:

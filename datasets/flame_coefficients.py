@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float32
 
 from meshanim.datasets.motion_dataset import DatasetOptions, Subject
+from meshanim.errors import MeshanimError
 from meshanim.heads import Head, HeadParameters, load_head
 
 __all__ = ["CoefficientOptions", "LateSubjects", "flame_template", "flame_vertices", "optional_head"]
@@ -30,36 +31,57 @@ class CoefficientOptions(DatasetOptions):
 
 
 class LateSubjects(Mapping[str, Subject]):
-    """Subjects whose names are known at once and who are read when first asked for.
+    """Subjects whose names are known at once, and whose shape is read when they are first asked for.
+
+    The shape is the mean over the frames of their first sequence that can be read, named in
+    `attributes["shape_from"]`; where none can, that is empty and the shape is zero.
 
     Parameters
     ----------
-    names : sequence of str
-        In the published order.
+    head : Head, optional
+        Gives the template; without it a template has no vertices.
+    sequences : sequence of (subject, sequence)
+        Names, subjects in the published order.
     read : callable
-        Makes the subject of a name.
+        The shape (T, S) of a sequence; MeshanimError where it cannot be read.
     """
 
-    def __init__(self, names: Sequence[str], read: Callable[[str], Subject]):
-        self._names = dict.fromkeys(names)
-        self._read = read
+    def __init__(
+        self,
+        head: Head | None,
+        sequences: Sequence[tuple[str, str]],
+        read: Callable[[str], Float32[np.ndarray, "frames shape"]],
+    ):
+        self._head, self._read = head, read
+        self._sequences: dict[str, list[str]] = {}
+        for subject, name in sequences:
+            self._sequences.setdefault(subject, []).append(name)
         self._subjects: dict[str, Subject] = {}
 
     def __getitem__(self, name: str) -> Subject:
-        if name not in self._names:
-            raise KeyError(name)
         if name not in self._subjects:
-            self._subjects[name] = self._read(name)
+            self._subjects[name] = self._subject(name, self._sequences[name])
         return self._subjects[name]
 
+    def _subject(self, name: str, sequences: list[str]) -> Subject:
+        for sequence in sequences:
+            try:
+                shape = self._read(sequence).mean(0)
+            except MeshanimError:
+                continue  # a defect of that sequence: reading it tells so
+            template = flame_template(self._head, shape)
+            return Subject(name, template, shape, {"shape_from": sequence})
+        nothing = np.zeros(1, np.float32)
+        return Subject(name, flame_template(self._head, nothing), nothing, {"shape_from": ""})
+
     def __contains__(self, name: object) -> bool:
-        return name in self._names
+        return name in self._sequences
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._names)
+        return iter(self._sequences)
 
     def __len__(self) -> int:
-        return len(self._names)
+        return len(self._sequences)
 
 
 def optional_head(name: str) -> Head | None:

@@ -28,11 +28,10 @@ from meshanim.audio import Waveform, load_waveform
 from meshanim.datasets.flame_coefficients import (
     CoefficientOptions,
     LateSubjects,
-    flame_template,
     flame_vertices,
     optional_head,
 )
-from meshanim.datasets.motion_dataset import MotionArrays, MotionDataset, SequenceInfo, Subject
+from meshanim.datasets.motion_dataset import MotionArrays, MotionDataset, SequenceInfo
 from meshanim.errors import DependencyError, FileFormatError
 
 __all__ = ["EMOTIONS", "MeadDataset", "MeadOptions"]
@@ -83,7 +82,7 @@ class MeadDataset(MotionDataset):
 
     Coefficients: `shape` (T, 300), as reconstructed, different in every frame; `expression` (T, 100); `jaw`
     (T, 3), axis-angle. The pose is `global_pose`, and zero in ProbTalk3D's layout, which dropped it. A
-    subject's shape is the mean over the frames of their first sequence.
+    subject's shape is the mean over the frames of their first sequence that can be read.
 
     Parameters
     ----------
@@ -127,8 +126,8 @@ class MeadDataset(MotionDataset):
         known = [name for names in PEOPLE.values() for name in names]
         there = {name.split("_")[0] for name in self.sequences}
         people = [name for name in known if name in there] + sorted(there - set(known))
-        self.subjects = LateSubjects(people, self._subject)
-        self._first = {name.split("_")[0]: name for name in reversed(self.sequences)}
+        names = [(person, name) for person in people for name in self.sequences if name.startswith(person)]
+        self.subjects = LateSubjects(self._head, names, self._shape)
         self.splits = {
             split: tuple(name for name in self.sequences if _in_split(name, split)) for split in SENTENCES
         } | {
@@ -148,9 +147,8 @@ class MeadDataset(MotionDataset):
                 files[f"{person}_{sentence}_{EMOTIONS.index(emotion)}_{int(level[-1]) - 1}"] = path
         return files
 
-    def _subject(self, person: str) -> Subject:
-        shape = self._read(self._first[person])["shape"].mean(0)
-        return Subject(person, flame_template(self._head, shape), shape)
+    def _shape(self, name: str) -> Float32[np.ndarray, "frames shape"]:
+        return self._read(name)["shape"]
 
     def _path(self, name: str) -> Path:
         self._known(name)
