@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import roma
 import torch
+import trimesh
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -24,6 +25,7 @@ N_VERTICES, N_FACES = 5023, 9976
 N_SHAPE, N_EXPRESSION = 300, 100
 TEETH = ("none", "plain", "split")
 YAW_LIMIT = 39
+TEMPLATES = ("head_template_mesh.obj", "head_template.obj")
 
 
 class FlameHead(Head):
@@ -41,11 +43,12 @@ class FlameHead(Head):
         regions: Mapping[str, np.ndarray],
         masks: Mapping[str, np.ndarray],
         embedding: Mapping[str, np.ndarray],
+        texture: tuple[np.ndarray, np.ndarray] | None = None,
     ):
         shape, expression = np.split(arrays.shape_directions, [N_SHAPE], axis=2)
         regressed = np.tensordot(arrays.joint_regressor, arrays.shape_directions, axes=1)
         super().__init__(
-            TriangleMesh(arrays.vertices, arrays.faces),
+            TriangleMesh(arrays.vertices, arrays.faces, *(texture or ())),
             shape,
             expression,
             [f"shape_{index:03d}" for index in range(N_SHAPE)],
@@ -125,7 +128,10 @@ class FlameHead(Head):
 
 
 def load_flame(path: str | Path, teeth: str = "none") -> FlameHead:
-    """Read a FLAME model file, with FLAME_masks.pkl and landmark_embedding.npy if they lie beside it.
+    """Read a FLAME model file, and what lies beside it of masks, landmarks and texture coordinates.
+
+    FLAME_masks.pkl, landmark_embedding.npy, and head_template_mesh.obj or head_template.obj: the texture
+    coordinates become `mesh.uv`; triangles of the teeth have none and share the point (0, 0).
 
     Parameters
     ----------
@@ -160,12 +166,54 @@ def load_flame(path: str | Path, teeth: str = "none") -> FlameHead:
             stacklevel=2,
         )
         regions = regions_from_default(arrays)
+    texture = _read_texture(path.parent, arrays.faces)
     if teeth != "none":
         arrays = add_teeth(arrays)
         if teeth == "split":
             arrays = split_teeth(arrays)
         regions = {**regions, "teeth": np.arange(N_VERTICES, len(arrays.vertices))}
-    return FlameHead(arrays, regions, masks, embedding)
+        if texture is not None:
+            texture = _without_teeth(*texture, len(arrays.faces))
+    return FlameHead(arrays, regions, masks, embedding, texture)
+
+
+def _read_texture(
+    folder: Path, faces: Int[np.ndarray, "faces 3"]
+) -> tuple[Float[np.ndarray, "uv 2"], Int[np.ndarray, "faces 3"]] | None:
+    """Texture coordinates, each once, and their indices a face; from the template's OBJ file, if there is one.
+
+    The file's faces must be the model's, in its order: each of the model's vertices must be one point of the
+    file and no two the same. Where that point lies does not matter: templates differ between releases.
+    """
+    path = next((folder / name for name in TEMPLATES if (folder / name).is_file()), None)
+    if path is None:
+        return None
+    try:
+        loaded = trimesh.load(path, process=False, force="mesh")
+    except (ValueError, IndexError, KeyError, AttributeError, TypeError) as error:
+        raise FileFormatError(f"{path} is no OBJ mesh: {error}") from error
+    uv = getattr(getattr(loaded, "visual", None), "uv", None)
+    if not isinstance(loaded, trimesh.Trimesh) or uv is None:
+        raise FileFormatError(f"{path} holds no texture coordinates; remove the file to do without")
+    if len(loaded.faces) != N_FACES:
+        raise FileFormatError(f"{path} has {len(loaded.faces)} triangles, FLAME has {N_FACES}")
+    point = np.unique(loaded.vertices, axis=0, return_inverse=True)[1]
+    corner = point.reshape(-1)[loaded.faces].ravel()
+    owner = np.full(N_VERTICES, -1)
+    owner[faces.ravel()] = corner
+    used = owner[owner >= 0]
+    if not np.array_equal(owner[faces.ravel()], corner) or len(np.unique(used)) != len(used):
+        raise FileFormatError(f"{path}: its triangles are not those of the model in the same order")
+    rows, index = np.unique(
+        np.asarray(uv, np.float64)[loaded.faces].reshape(-1, 2), axis=0, return_inverse=True
+    )
+    return rows, index.reshape(-1, 3)
+
+
+def _without_teeth(uv: np.ndarray, uv_faces: np.ndarray, n_faces: int) -> tuple[np.ndarray, np.ndarray]:
+    """Texture coordinates of the head; those of the teeth, the faces behind it, are one point."""
+    teeth = np.full((n_faces - len(uv_faces), 3), len(uv))
+    return np.concatenate([uv, np.zeros((1, 2))]), np.concatenate([uv_faces, teeth])
 
 
 def _read_masks(path: Path) -> dict[str, np.ndarray]:

@@ -219,3 +219,63 @@ def test_files_that_are_no_models(flame_folder, tmp_path):
         load_flame(tmp_path / "text.npz")
     with pytest.raises(OptionError, match="teeth"):
         load_flame(cut, "gold")
+
+
+def write_template(path, vertices, faces, uv, uv_faces):
+    lines = [f"v {x:.9f} {y:.9f} {z:.9f}" for x, y, z in vertices]
+    lines += [f"vt {u:.9f} {v:.9f}" for u, v in uv]
+    for corners, coordinates in zip(faces + 1, uv_faces + 1):
+        lines.append("f " + " ".join(f"{a}/{b}" for a, b in zip(corners, coordinates)))
+    path.write_text("\n".join(lines) + "\n")
+
+
+@pytest.fixture
+def textured(flame_content, flame_folder, tmp_path):
+    """The made model with a template beside it whose texture has a seam: 5,118 coordinates."""
+    (tmp_path / "generic_model.pkl").write_bytes((flame_folder / "generic_model.pkl").read_bytes())
+    (tmp_path / "FLAME_masks.pkl").write_bytes((flame_folder / "FLAME_masks.pkl").read_bytes())
+    faces = flame_content["f"].astype(np.int64)
+    uv = np.random.default_rng(5).uniform(0, 1, (5118, 2))
+    uv_faces = faces.copy()
+    twice = np.unique(faces)[:95]
+    for new, vertex in enumerate(twice, start=5023):  # one of the vertex's triangles lies beyond the seam
+        face = np.flatnonzero((faces == vertex).any(1))[0]
+        uv_faces[face][faces[face] == vertex] = new
+    return tmp_path, flame_content["v_template"] + 0.001, faces, uv, uv_faces
+
+
+@pytest.mark.parametrize(
+    ("name", "teeth", "n_faces"),
+    [("head_template_mesh.obj", "none", 9976), ("head_template.obj", "split", 10648)],
+)
+def test_texture_coordinates_of_the_template(textured, name, teeth, n_faces):
+    folder, vertices, faces, uv, uv_faces = textured
+    write_template(folder / name, vertices, faces, uv, uv_faces)
+    mesh = load_flame(folder / "generic_model.pkl", teeth).mesh
+    assert mesh.uv_faces.shape == (n_faces, 3)
+    assert np.allclose(mesh.uv[mesh.uv_faces[:9976]], uv[uv_faces], atol=1e-8)
+    assert np.array_equal(mesh.faces[:9976], faces)
+    assert (mesh.uv[mesh.uv_faces[9976:]] == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda v, f, uv, t: (v, f[::-1], uv, t[::-1]), "same order"),
+        (lambda v, f, uv, t: (v, np.roll(f, 1, axis=1), uv, t), "same order"),
+        (lambda v, f, uv, t: (v, f[:-1], uv, t[:-1]), "9975 triangles"),
+    ],
+)
+def test_templates_of_other_meshes_are_refused(textured, change, message):
+    folder, *template = textured
+    write_template(folder / "head_template_mesh.obj", *change(*template))
+    with pytest.raises(FileFormatError, match=message):
+        load_flame(folder / "generic_model.pkl")
+
+
+def test_templates_without_texture_are_refused(textured):
+    folder, vertices, faces, _, _ = textured
+    lines = [f"v {x} {y} {z}" for x, y, z in vertices] + [f"f {a} {b} {c}" for a, b, c in faces + 1]
+    (folder / "head_template.obj").write_text("\n".join(lines))
+    with pytest.raises(FileFormatError, match="no texture coordinates"):
+        load_flame(folder / "generic_model.pkl")
