@@ -118,7 +118,7 @@ class DiffPoseTalkDataset(MotionDataset):
     def _list_clips(self) -> dict[str, list[int]]:
         """Numbers of the clips by key of their video."""
         clips: dict[str, list[int]] = {}
-        found = defaultdict(list)
+        found: dict[str, list[int]] = defaultdict(list)
         with self._reading() as transaction:
             for raw in transaction.cursor().iternext(keys=True, values=False):
                 key, _, last = raw.decode("utf-8", "replace").rpartition("/")

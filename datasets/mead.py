@@ -109,7 +109,7 @@ class MeadDataset(MotionDataset):
         if any(NAME.fullmatch(path.stem) for path in (directory / "param").glob("*.npy")):
             return True
         root = _reconstructions(directory)
-        return any(path.parent.is_dir() for path in root.glob("[MW][0-9]*/front/*"))
+        return any(True for _ in root.glob("[MW][0-9]*/front/*/level_[1-3]"))
 
     def __init__(self, directory: str | Path, options: MeadOptions | None = None):
         super().__init__(directory, options)
@@ -268,7 +268,7 @@ def _dataset(path: Path, file: Any, key: str) -> Any:
     if key not in file:
         raise FileFormatError(f"{path} lacks {key}; it has {', '.join(file) or 'nothing'}")
     entry = file[key]
-    shape = getattr(entry, "shape", ())
+    shape: tuple[int, ...] = getattr(entry, "shape", ())
     if len(shape) != 3 or shape[0] != 1 or shape[2] != WIDTHS[key] or entry.dtype.kind != "f":
         raise FileFormatError(
             f"{path}: {key} has shape {shape}, expected floats of (1, frames, {WIDTHS[key]})"

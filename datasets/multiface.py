@@ -265,7 +265,7 @@ class MultifaceDataset(MotionDataset):
             rotation[index], translation[index] = read_head_pose(path.with_name(f"{path.stem}_transform.txt"))
         pose = roma.rotmat_to_rotvec(torch.from_numpy(rotation)).numpy().astype(np.float32)
         numbers = np.array([_number(path) for path in paths], np.int64)
-        coefficients = {"translation": translation, "frame_number": numbers}
+        coefficients: dict[str, np.ndarray] = {"translation": translation, "frame_number": numbers}
         return MotionArrays(vertices, pose, coefficients=coefficients)
 
     def audio(self, name: str) -> Waveform:

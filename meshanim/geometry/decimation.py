@@ -9,6 +9,7 @@ import scipy.sparse as sp
 
 from meshanim.errors import MeshError, OptionError
 from meshanim.geometry.closest_points import barycentric_coordinates
+from meshanim.geometry.decimation_uv import decimated_texture
 from meshanim.geometry.mesh import TriangleMesh
 from meshanim.geometry.topology import edge_uses
 from meshanim.geometry.transfer import barycentric_operator
@@ -48,7 +49,8 @@ def decimate(mesh: TriangleMesh, n_faces: int) -> Decimation:
 
     Connected components are reduced by the same share, each to 8 triangles at least, and a new vertex takes
     its values from that part of the surface which was merged into it: eyelids do not borrow from the eyes
-    behind them, nor one lip from the other. Texture coordinates follow where there is one for each vertex.
+    behind them, nor one lip from the other. Texture coordinates follow, those of a layout with seams by
+    `decimated_texture`.
 
     Parameters
     ----------
@@ -70,10 +72,13 @@ def decimate(mesh: TriangleMesh, n_faces: int) -> Decimation:
     positions, faces, cluster = _collapse(mesh, n_faces)
     corners, weights = _closest_in(mesh, _touching(cluster, mesh.faces, len(positions)), positions)
     operator = barycentric_operator(corners, weights, mesh.n_vertices)
-    uv = None
+    positions = operator @ mesh.vertices
+    uv = uv_faces = None
     if mesh.uv is not None and mesh.uv_faces is mesh.faces:
         uv = operator @ mesh.uv
-    return Decimation(TriangleMesh(operator @ mesh.vertices, faces, uv=uv), operator, cluster)
+    elif mesh.uv is not None:
+        uv, uv_faces = decimated_texture(mesh, cluster, positions, faces)
+    return Decimation(TriangleMesh(positions, faces, uv, uv_faces), operator, cluster)
 
 
 def prolongation(mesh: TriangleMesh, count: int, method: str = "barycentric") -> Prolongation:

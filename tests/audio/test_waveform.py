@@ -32,6 +32,32 @@ def test_24_bit_stereo_8_khz(tmp_path):
     assert load_waveform(path).duration == pytest.approx(0.5)
 
 
+def test_sound_of_a_container(tmp_path):
+    """An .m4a, as phones and MEAD have them: AAC, which keeps a tone nearly as it is."""
+    import av
+
+    path = tmp_path / "tone.m4a"
+    given = 0.5 * tone(440, 48000)
+    with av.open(str(path), "w", format="mp4") as file:
+        stream = file.add_stream("aac", rate=48000)
+        stream.layout = "stereo"
+        samples = np.stack([given, 0.5 * given])
+        frame = av.AudioFrame.from_ndarray(samples, format="fltp", layout="stereo")
+        frame.rate, frame.pts = 48000, 0
+        for packet in (*stream.encode(frame), *stream.encode(None)):
+            file.mux(packet)
+    waveform = load_waveform(path, rate=None)
+    assert waveform.rate == 48000
+    assert waveform.duration == pytest.approx(0.5, abs=1024 / 48000)
+    middle = slice(4096, 20000)
+    read, expected = waveform.samples[middle], 0.75 * given[middle]
+    assert np.corrcoef(read, expected)[0, 1] > 0.99
+    assert np.abs(read).mean() == pytest.approx(np.abs(expected).mean(), rel=0.05)
+    path.write_bytes(path.read_bytes()[:300])
+    with pytest.raises(FileFormatError, match=r"tone\.m4a cannot be read as sound"):
+        load_waveform(path)
+
+
 def test_own_rate_is_kept_on_request(tmp_path):
     path = tmp_path / "speech.wav"
     soundfile.write(path, tone(300, 44100), 44100)

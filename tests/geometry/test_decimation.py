@@ -7,7 +7,16 @@ from hypothesis import strategies as st
 from shapes import bow_tie, collapsed, moved, plane, sphere, three_pages, torus, union
 
 from meshanim.errors import MeshError, OptionError
-from meshanim.geometry import TriangleMesh, carry, closest_points, decimate, prolongation, transfer_operator
+from meshanim.geometry import (
+    TriangleMesh,
+    carry,
+    closest_points,
+    decimate,
+    prolongation,
+    rasterize_uv,
+    transfer_operator,
+)
+from meshanim.heads import load_head
 
 PARTS = union(sphere(3), moved(sphere(2, 0.2), (0.75, 0, 0)), moved(torus(), (4, 0, 0)))
 
@@ -70,10 +79,73 @@ def test_texture_follows_where_each_vertex_has_one():
     textured = TriangleMesh(mesh.vertices, mesh.faces, uv=mesh.vertices[:, :2])
     small = decimate(textured, 60).mesh
     np.testing.assert_allclose(small.uv, small.vertices[:, :2], atol=1e-12)
-    assert (
-        decimate(TriangleMesh(mesh.vertices, mesh.faces, mesh.vertices[:, :2], mesh.faces.copy()), 60).mesh.uv
-        is None
+    apart = decimate(
+        TriangleMesh(mesh.vertices, mesh.faces, mesh.vertices[:, :2], mesh.faces.copy()), 60
+    ).mesh
+    assert len(apart.uv) == apart.n_vertices
+    corners = apart.vertices[apart.faces][:, :, :2]
+    np.testing.assert_allclose(apart.uv[apart.uv_faces], corners, atol=1e-8)
+
+
+def unrolled_torus(around=48, across=24):
+    """A torus whose layout is the unit square, cut open once around and once across."""
+    i, j = np.meshgrid(np.arange(around), np.arange(across), indexing="ij")
+    turn, roll = 2 * np.pi * i / around, 2 * np.pi * j / across
+    ring = 1 + 0.4 * np.cos(roll)
+    vertices = np.stack([ring * np.cos(turn), ring * np.sin(turn), 0.4 * np.sin(roll)], axis=-1)
+
+    def triangles(rows, columns):
+        def index(di, dj):
+            return ((i + di) % rows * columns + (j + dj) % columns).ravel()
+
+        a, b, c, d = index(0, 0), index(1, 0), index(1, 1), index(0, 1)
+        return np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+
+    u, v = np.meshgrid(np.arange(around + 1) / around, np.arange(across + 1) / across, indexing="ij")
+    uv = np.stack([u.ravel(), v.ravel()], axis=1)
+    return TriangleMesh(
+        vertices.reshape(-1, 3), triangles(around, across), uv, triangles(around + 1, across + 1)
     )
+
+
+def layout_areas(mesh):
+    a, b, c = mesh.uv[mesh.uv_faces].transpose(1, 0, 2)
+    return 0.5 * ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
+
+
+@pytest.mark.parametrize("n_faces", [2304, 1500, 600, 250])
+def test_texture_keeps_to_one_side_of_a_seam(n_faces):
+    small = decimate(unrolled_torus(), n_faces).mesh
+    uv = small.uv[small.uv_faces]
+    assert np.ptp(uv, axis=1).max() < 0.5
+    x, y, z = small.vertices[small.faces].transpose(2, 0, 1)
+    angles = np.stack([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y) - 1)], axis=-1) / (2 * np.pi)
+    error = np.abs((uv - angles + 0.5) % 1 - 0.5)
+    # A triangle across the seam takes what its side has of it: its far corner lies on the cut.
+    assert np.quantile(error, 0.9) < 0.01
+    assert error.max() < 0.15
+    areas = layout_areas(small)
+    assert (areas > -1e-3).all()
+    assert 1 - 25 / n_faces - 0.03 < areas.sum() < 1.01  # less what lies across the seams
+
+
+def test_texture_of_the_default_head_follows():
+    from meshanim.geometry.topology import vertex_components
+
+    mesh = load_head("default").mesh
+    small = decimate(mesh, 3000).mesh
+    charts = vertex_components(mesh.uv_faces, len(mesh.uv)).max() + 1
+    assert vertex_components(small.uv_faces, len(small.uv)).max() + 1 >= charts
+    face, weights = rasterize_uv(mesh, 128)
+    small_face, small_weights = rasterize_uv(small, 128)
+    both = (face >= 0) & (small_face >= 0)
+    assert both.sum() > 0.93 * (face >= 0).sum()
+    assert ((small_face >= 0) & (face < 0)).sum() < 0.03 * (face >= 0).sum()
+    old = np.einsum("nk,nkd->nd", weights[both], mesh.vertices[mesh.faces[face[both]]])
+    new = np.einsum("nk,nkd->nd", small_weights[both], small.vertices[small.faces[small_face[both]]])
+    distance = np.linalg.norm(old - new, axis=1)
+    assert np.median(distance) < 1e-3
+    assert np.quantile(distance, 0.99) < 8e-3
 
 
 @pytest.mark.parametrize("method", ["barycentric", "biharmonic"])
