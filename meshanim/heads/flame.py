@@ -180,7 +180,7 @@ def load_flame(path: str | Path, teeth: str = "none") -> FlameHead:
 def _read_texture(
     folder: Path, faces: Int[np.ndarray, "faces 3"]
 ) -> tuple[Float[np.ndarray, "uv 2"], Int[np.ndarray, "faces 3"]] | None:
-    """Texture coordinates, each once, and their indices a face; from the template's OBJ file, if there is one.
+    """Texture coordinates, each once, and their indices a face; from the template's OBJ file, if any.
 
     The file's faces must be the model's, in its order: each of the model's vertices must be one point of the
     file and no two the same. Where that point lies does not matter: templates differ between releases.
