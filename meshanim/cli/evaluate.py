@@ -3,7 +3,9 @@
 import sys
 
 from meshanim.results import Results
+from meshanim.training.gava_ablation import AblationOptions, ablation_table, gava_ablation
 from meshanim.training.gava_evaluation import EvaluateGavaOptions, evaluate_gava
+from meshanim.training.gava_maps import GavaMapsOptions, draw_gava_maps
 
 __all__ = ["COMMANDS"]
 
@@ -16,4 +18,13 @@ def _gava(options: EvaluateGavaOptions) -> None:
         print("\n" + Results(results.name, others, results.machine).table())
 
 
-COMMANDS = {"gava": _gava}
+def _gava_ablation(options: AblationOptions) -> None:
+    print(ablation_table(gava_ablation(options, progress=sys.stderr.isatty())))
+
+
+def _gava_maps(options: GavaMapsOptions) -> None:
+    draw_gava_maps(options)
+    print(f"wrote {options.output}")
+
+
+COMMANDS = {"gava": _gava, "gava-ablation": _gava_ablation, "gava-maps": _gava_maps}

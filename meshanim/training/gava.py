@@ -210,6 +210,8 @@ class TrainGavaOptions:
     """Attention blocks."""
     heads: int = 4
     """Attention heads."""
+    rings: int = 1
+    """Mesh edges that attention crosses in one block; 1 is the paper's."""
     tokens: int = 0
     """Attention on so many vertices, spread by what moves; 0 for one token a vertex."""
     rank: int = 128
@@ -262,6 +264,7 @@ def train_gava(options: TrainGavaOptions, progress: bool = True) -> Path:
         width=options.width,
         layers=options.layers,
         heads=options.heads,
+        rings=options.rings,
         tokens=options.tokens or "vertices",
         rank=options.rank,
         dropout=options.dropout,

@@ -73,7 +73,6 @@ def evaluate_gava(options: EvaluateGavaOptions, progress: bool = True) -> Result
             )
         models[describe(name, model)] = model
     head = load_head(dataset.head) if dataset.head else None
-    still = mean_displacement(dataset)
     masks = masks_of_head(head)
     methods: dict[str, Callable[[MotionSequence], Motion]] = {}
     for name, model in models.items():
@@ -82,17 +81,13 @@ def evaluate_gava(options: EvaluateGavaOptions, progress: bool = True) -> Result
         seal = head_lip_seal(head)
         if seal is not None and getattr(encoder, "bilabial", None) is not None:
             methods[f"{name} + lip seal"] = speaker(model, encoder, dataset, seal)
-    methods["mean of training"] = lambda s: np.repeat(
-        (dataset.subjects[s.info.subject].template + still)[None], len(s), 0
-    )
-    methods["template held still"] = lambda s: np.repeat(
-        dataset.subjects[s.info.subject].template[None], len(s), 0
-    )
+    methods |= held_still(dataset)
     results = Results("evaluate gava")
     for split in options.splits:
         for name, predict in methods.items():
             evaluation = MotionEvaluation(masks, dataset.fps, jitter_above=options.jitter_above)
-            for value in measure(dataset, split, predict, evaluation, f"{split}: {name}", progress):
+            names = dataset.split(split)
+            for value in measure(dataset, names, predict, evaluation, f"{split}: {name}", progress):
                 results.add_measured(split, name, value)
     if masks.lip_pairs is not None:
         rows = articulation(
@@ -144,6 +139,16 @@ def mean_displacement(dataset: MeshanimDataset) -> Float32[np.ndarray, "vertices
     return (total / max(frames, 1)).astype(np.float32)
 
 
+def held_still(dataset: MeshanimDataset) -> dict[str, Callable[[MotionSequence], Motion]]:
+    """Baselines that do not move: the training frames' mean displacement, and none."""
+    mean = mean_displacement(dataset)
+
+    def resting(moved: Float32[np.ndarray, "vertices 3"]) -> Callable[[MotionSequence], Motion]:
+        return lambda s: np.repeat((dataset.subjects[s.info.subject].template + moved)[None], len(s), 0)
+
+    return {"mean of training": resting(mean), "template held still": resting(np.zeros_like(mean))}
+
+
 def spoken(
     model: Gava,
     encoder: SpeechEncoder,
@@ -191,20 +196,20 @@ def speaker(
 
 def measure(
     dataset: MeshanimDataset,
-    split: str,
+    names: Sequence[str],
     predict: Callable[[MotionSequence], Motion],
     evaluation: MotionEvaluation,
     label: str,
     progress: bool,
 ) -> list[MetricValue]:
-    """Score a split sequence by sequence.
+    """Score sequences one after the other.
 
     Parameters
     ----------
     dataset : MeshanimDataset
         The truth.
-    split : str
-        Of the data set.
+    names : sequence of str
+        Of the sequences, such as a split's.
     predict : function
         A sequence to its vertices, as `speaker` gives it.
     evaluation : MotionEvaluation
@@ -214,7 +219,7 @@ def measure(
     progress : bool
         Whether to show it.
     """
-    for name in tqdm(dataset.split(split), desc=label, unit="clip", disable=not progress):
+    for name in tqdm(names, desc=label, unit="clip", disable=not progress):
         sequence = dataset[name]
         evaluation.add(
             name,
