@@ -4,9 +4,11 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from tyro.conf import Positional
 
 from meshanim.datasets import MeshanimDataset
+from meshanim.datasets.pose_augmentation import AugmentPoseOptions, augment_pose
 from meshanim.datasets.synthetic.corpus import SynthesizeOptions, synthesize
 
 __all__ = ["COMMANDS", "CheckOptions"]
@@ -42,4 +44,14 @@ def _check(options: CheckOptions) -> int:
     return 2 if faults else 0
 
 
-COMMANDS = {"synthesize": _synthesize, "check": _check}
+def _augment_pose(options: AugmentPoseOptions) -> int:
+    found = augment_pose(options, progress=sys.stderr.isatty())
+    mean, deviation, largest, speed = np.degrees([found.mean, found.deviation, found.largest, found.speed])
+    print(
+        f"{found.counts.sum()} frames: rotation {mean:.2f} ± {deviation:.2f} degrees, largest {largest:.2f}, "
+        f"{speed:.2f} degrees a second"
+    )
+    return 0
+
+
+COMMANDS = {"synthesize": _synthesize, "check": _check, "augment-pose": _augment_pose}
