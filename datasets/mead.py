@@ -126,8 +126,9 @@ class MeadDataset(MotionDataset):
         known = [name for names in PEOPLE.values() for name in names]
         there = {name.split("_")[0] for name in self.sequences}
         people = [name for name in known if name in there] + sorted(there - set(known))
-        names = [(person, name) for person in people for name in self.sequences if name.startswith(person)]
-        self.subjects = LateSubjects(self._head, names, self._shape)
+        order = {person: index for index, person in enumerate(people)}
+        names = [(name.split("_")[0], name) for name in self.sequences]
+        self.subjects = LateSubjects(self._head, sorted(names, key=lambda pair: order[pair[0]]), self._shape)
         self.splits = {
             split: tuple(name for name in self.sequences if _in_split(name, split)) for split in SENTENCES
         } | {
