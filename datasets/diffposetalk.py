@@ -227,7 +227,7 @@ class DiffPoseTalkDataset(MotionDataset):
                     raise FileFormatError(f"{path} has no {name}_{moment} of {width} numbers")
         return statistics
 
-    def check(self, progress: bool = False) -> list[str]:
+    def check(self, progress: bool = False, workers: int = 1) -> list[str]:
         """As of every data set; also clips of no video, and keys.txt against the database."""
         return [*super().check(progress), *self._key_defects()]
 

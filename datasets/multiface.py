@@ -284,7 +284,7 @@ class MultifaceDataset(MotionDataset):
             raise OptionError(f"{self.directory} has no {subject!r}; there are {', '.join(self._folders)}")
         return read_krt(self._folders[subject] / "KRT")
 
-    def check(self, progress: bool = False) -> list[str]:
+    def check(self, progress: bool = False, workers: int = 1) -> list[str]:
         """As of every data set; also gaps, frames that are not listed, and templates that are no neutral."""
         return [*super().check(progress), *self._frame_defects()]
 

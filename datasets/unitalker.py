@@ -307,7 +307,7 @@ class UniTalkerDataset(MotionDataset):
             )
         return PrincipalComponents(components, mean, *moments)
 
-    def check(self, progress: bool = False) -> list[str]:
+    def check(self, progress: bool = False, workers: int = 1) -> list[str]:
         """As of every data set; also a damaged pca.npz."""
         defects = super().check(progress)
         try:
