@@ -162,7 +162,8 @@ class Animator:
     model_head : Head, optional
         The head whose topology the network was trained on: gives identities, lip pairs and eye shapes.
     head : Head, optional
-        The head to animate; `model_head` if not given. Another topology is reached by surface correspondence.
+        The head to animate; `model_head` if not given. With the faces of one of the network's topologies,
+        that one is animated; another topology is reached by surface correspondence.
 
     Raises
     ------
@@ -178,14 +179,20 @@ class Animator:
                 f"encoder {encoder.name} gives {encoder.dim} features a frame, the network reads "
                 f"{model.config.feature_dim}: it was trained with {model.config.encoder}"
             )
-        self.model = model.eval()
+        self.network = model.eval()
+        views = [model.on(k) for k in range(model.n_topologies)]
+        self.model = views[0]
         self.encoder = encoder
         self.mel = MelEncoder()
         self.model_head = model_head
         self.head = model_head if head is None else head
         self.correspondence = None
-        if head is not None and not _same_faces(head.mesh, model.mesh):
-            self.correspondence = surface_correspondence(model.mesh, head.mesh)
+        if head is not None:
+            own = next((view for view in views if _same_faces(head.mesh, view.mesh)), None)
+            if own is None:
+                self.correspondence = surface_correspondence(self.model.mesh, head.mesh)
+            elif own is not self.model:
+                self.model, self.model_head = own, head
 
     @classmethod
     def from_pretrained(
@@ -249,9 +256,19 @@ class Animator:
         options : AnimationOptions, optional
             How it is performed.
         template : (V, 3), optional
-            Who speaks: the face at rest, metres, in the network's topology; its own template if not given.
+            Who speaks: the face at rest, metres, in one of the network's topologies; its own if not given.
         """
-        return AnimationStream(self, rate, options or AnimationOptions(), template)
+        return AnimationStream(self.on_template(template), rate, options or AnimationOptions(), template)
+
+    def on_template(self, template: Template | None) -> "Animator":
+        """The animator of the topology that has a template's number of vertices; this one if none has."""
+        if template is None or len(template) == self.model.n_vertices:
+            return self
+        for k in range(self.network.n_topologies):
+            view = self.network.on(k)
+            if view.n_vertices == len(template):
+                return Animator(view, self.encoder, load_head(view.config.head) if view.config.head else None)
+        return self
 
     def stream(
         self,
@@ -285,13 +302,16 @@ class Animator:
         options : AnimationOptions, optional
             How it is performed.
         template : (V, 3), optional
-            Who speaks: the face at rest, metres, in the network's topology; its own template if not given.
+            Who speaks: the face at rest, metres, in one of the network's topologies; its own if not given.
 
         Raises
         ------
         FileFormatError, ShapeError
             If the file is not sound, is empty or holds NaN.
         """
+        fitting = self.on_template(template)
+        if fitting is not self:
+            return fitting(speech, options, template)
         waveform = speech if isinstance(speech, Waveform) else load_waveform(speech, rate=None)
         stream = self.open(waveform.rate, options, template)
         block = max(1, waveform.rate)  # a second at a time: memory for the result only

@@ -10,6 +10,7 @@ from tyro.conf import Positional
 from meshanim.datasets import MeshanimDataset
 from meshanim.datasets.pose_augmentation import AugmentPoseOptions, augment_pose
 from meshanim.datasets.synthetic.corpus import SynthesizeOptions, synthesize
+from meshanim.training.feature_cache import CacheFeaturesOptions, cache_features
 
 __all__ = ["COMMANDS", "CheckOptions"]
 
@@ -54,4 +55,13 @@ def _augment_pose(options: AugmentPoseOptions) -> int:
     return 0
 
 
-COMMANDS = {"synthesize": _synthesize, "check": _check, "augment-pose": _augment_pose}
+def _cache_features(options: CacheFeaturesOptions) -> None:
+    print(f"wrote {cache_features(options, progress=sys.stderr.isatty())}")
+
+
+COMMANDS = {
+    "synthesize": _synthesize,
+    "check": _check,
+    "augment-pose": _augment_pose,
+    "cache-features": _cache_features,
+}

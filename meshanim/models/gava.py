@@ -1,13 +1,14 @@
 """GAVA: speech to a talking, turning head by attention over the mesh (Li et al., TVCG 2025)."""
 
+import copy
 import json
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
-from huggingface_hub import PyTorchModelHubMixin, hf_hub_download
+from huggingface_hub import ModelCard, PyTorchModelHubMixin, hf_hub_download
 from jaxtyping import Float, Int
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
@@ -26,9 +27,28 @@ from meshanim.models.gava_parts import (
 )
 from meshanim.models.vertex_tokens import VertexTokens
 
-__all__ = ["Gava", "GavaConfig", "GavaOutput"]
+__all__ = ["Gava", "GavaConfig", "GavaOutput", "Topology"]
 
 WEIGHTS, CONFIG = "model.safetensors", "config.json"
+
+
+@dataclass(frozen=True)
+class Topology:
+    """One of the meshes that a network animates.
+
+    Parameters
+    ----------
+    name : str
+        What it is called: the data set it comes from.
+    head : str
+        As `load_head` takes it; "" for any other mesh.
+    fps : float
+        Frames a second of its training data.
+    """
+
+    name: str
+    head: str = ""
+    fps: float = 30.0
 
 
 @dataclass(frozen=True)
@@ -80,6 +100,8 @@ class GavaConfig:
         Animation frames a second in training; any rate can be asked for.
     head : str
         The head whose topology this is, as `load_head` takes it; "" for any other mesh.
+    topologies : sequence of Topology
+        All of them where a network animates several, the one of `fps` and `head` first; `each` gives them.
 
     Raises
     ------
@@ -114,6 +136,7 @@ class GavaConfig:
     mel_rate: float = 100.0
     fps: float = 30.0
     head: str = ""
+    topologies: Sequence[Topology | Mapping[str, Any]] = ()
 
     def __post_init__(self):
         for name in ("feature_dim", "width", "layers", "heads", "window", "mel_bands", "mel_frames", "rank"):
@@ -125,6 +148,16 @@ class GavaConfig:
             raise OptionError(f"width {self.width} is not a multiple of {self.heads} heads")
         object.__setattr__(self, "subjects", tuple(self.subjects))
         object.__setattr__(self, "emotions", tuple(self.emotions))
+        entries = (Topology(**t) if isinstance(t, Mapping) else t for t in self.topologies)
+        object.__setattr__(self, "topologies", tuple(entries))
+        if self.decoder == "mlp" and len(self.topologies) > 1:
+            raise OptionError('decoder "mlp" has weights for the vertices of one topology, not of several')
+
+    @property
+    def each(self) -> tuple[Topology, ...]:
+        """The topologies; one without a name where a network animates one."""
+        named = tuple(entry for entry in self.topologies if isinstance(entry, Topology))
+        return named or (Topology("", self.head, self.fps),)
 
 
 class GavaOutput(NamedTuple):
@@ -147,6 +180,9 @@ class Gava(nn.Module, PyTorchModelHubMixin):
         The network.
     surface : TriangleMesh or VertexTokens
         The mesh to animate, any topology. A mesh is turned into tokens with the options of `config`.
+    others : sequence of TriangleMesh or VertexTokens
+        Further topologies, in the order of `config.topologies`: the weights are shared, tokens, attention
+        graph, embedding and prolongation are each one's own. `on` chooses.
 
     Notes
     -----
@@ -165,13 +201,26 @@ class Gava(nn.Module, PyTorchModelHubMixin):
     pose_mean: Tensor
     pose_scale: Tensor
     decoder: TransformerDecoder | GlobalDecoder
+    others: nn.ModuleList
 
-    def __init__(self, config: GavaConfig, surface: TriangleMesh | VertexTokens):
+    def __init__(
+        self,
+        config: GavaConfig,
+        surface: TriangleMesh | VertexTokens,
+        others: Sequence[TriangleMesh | VertexTokens] = (),
+    ):
         super().__init__()
         self.config = config
-        if isinstance(surface, TriangleMesh):
-            surface = VertexTokens.from_mesh(surface, config.tokens, config.eigenfunctions)
+        if len(others) + 1 != len(config.each):
+            raise OptionError(f"{len(config.each)} topologies are named, there are {len(others) + 1}")
+        surface, *rest = (
+            VertexTokens.from_mesh(one, config.tokens, config.eigenfunctions)
+            if isinstance(one, TriangleMesh)
+            else one
+            for one in (surface, *others)
+        )
         self.surface = surface
+        self.others = nn.ModuleList(rest)
         width, rank = config.width, config.rank
         self.register_buffer("feature_mean", torch.zeros(config.feature_dim))
         self.register_buffer("feature_scale", torch.ones(config.feature_dim))
@@ -210,6 +259,34 @@ class Gava(nn.Module, PyTorchModelHubMixin):
     def mesh(self) -> TriangleMesh:
         """The reference template and its faces."""
         return self.surface.mesh
+
+    @property
+    def n_topologies(self) -> int:
+        return 1 + len(self.others)
+
+    def on(self, topology: int | str) -> "Gava":
+        """This network on one of its topologies: a view that shares all weights, and saves as that one alone.
+
+        Raises
+        ------
+        OptionError
+            If there is no such topology.
+        """
+        if self.n_topologies == 1 and topology == 0:
+            return self
+        names = [entry.name for entry in self.config.each]
+        number = names.index(topology) if topology in names else topology
+        if not isinstance(number, int) or not 0 <= number < len(names):
+            raise OptionError(
+                f"no topology {topology!r} in this checkpoint; it has {', '.join(names) or 'one'}"
+            )
+        entry = self.config.each[number]
+        view = copy.copy(self)
+        view._modules = dict(self._modules)
+        view._modules["surface"] = self.surface if number == 0 else self.others[number - 1]
+        view._modules["others"] = nn.ModuleList()
+        view.config = replace(self.config, head=entry.head, fps=entry.fps, topologies=())
+        return view
 
     def graph(self) -> MeshGraph:
         """The attention pattern on the module's device."""
@@ -398,6 +475,10 @@ class Gava(nn.Module, PyTorchModelHubMixin):
         with written_whole(save_directory / CONFIG) as temporary:
             temporary.write_text(json.dumps(asdict(self.config), indent=2) + "\n")
 
+    def generate_model_card(self, *args, **kwargs) -> ModelCard:
+        """README.md of a saved folder, where whoever saves it has not written another."""
+        return ModelCard(model_card(self))
+
     @classmethod
     def _from_pretrained(  # type: ignore[override]
         cls,
@@ -430,11 +511,39 @@ class Gava(nn.Module, PyTorchModelHubMixin):
             )
         try:
             state = load_file(weights, device=map_location)
-            surface = VertexTokens.from_state(
-                {name.removeprefix("surface."): t for name, t in state.items() if name.startswith("surface.")}
-            )
-            model = cls(config, surface)
+            prefixes = ["surface.", *(f"others.{k}." for k in range(len(config.each) - 1))]
+            surfaces = [
+                VertexTokens.from_state({n.removeprefix(p): t for n, t in state.items() if n.startswith(p)})
+                for p in prefixes
+            ]
+            model = cls(config, surfaces[0], surfaces[1:])
             model.load_state_dict(state)
         except (OSError, SafetensorError, RuntimeError) as error:
             raise FileFormatError(f"{weights} is not a GAVA checkpoint: {error}") from error
         return model.to(map_location).eval()
+
+
+def model_card(model: Gava, sections: Mapping[str, str] | None = None) -> str:
+    """README.md of a checkpoint: what it is, how to use it, and what else is known, by heading."""
+    config = model.config
+    surfaces = [model.surface, *model.others]
+    rows = []
+    for entry, surface in zip(config.each, surfaces, strict=True):
+        head = f", head `{entry.head}`" if entry.head else ""
+        name = f"{entry.name}: " if entry.name else ""
+        counts = f"{surface.n_vertices:,} vertices, {surface.n_tokens:,} tokens"
+        rows.append(f"- {name}{counts}, {entry.fps:g} frames a second{head}")
+    text = [
+        "---\nlibrary_name: meshanim\ntags: [talking-head, speech-driven-animation]\n---",
+        "# GAVA: speech to a talking head",
+        "Speech to vertex displacements and head pose by attention over the mesh (Li et al., TVCG 2025).",
+        "    meshanim animate speech.wav -o talk.mp4 --model FOLDER",
+        f"Features `{config.features}`, decoder `{config.decoder}`, width {config.width}, "
+        f"{config.layers} layers, {config.heads} heads, rank {config.rank}. Speech encoder "
+        f"`{config.encoder}`. Everything else is in `{CONFIG}`.",
+        "\n".join(rows),
+        f"Styles: {', '.join(config.subjects) or 'none'}. Emotions: {', '.join(config.emotions)}.",
+    ]
+    for heading, content in (sections or {}).items():
+        text += [f"## {heading}", content]
+    return "\n\n".join(text) + "\n"

@@ -137,7 +137,7 @@ class AblationOptions:
         """
         variant = VARIANTS[name]
         return TrainGavaOptions(
-            data=self.data,
+            data=(self.data,),
             output=self.output / f"{name}-{seed}",
             encoder=self.encoder,
             features=variant.features,

@@ -66,11 +66,7 @@ def evaluate_gava(options: EvaluateGavaOptions, progress: bool = True) -> Result
     dataset = MeshanimDataset(options.data)
     models = {}
     for name in (options.model, *map(str, options.compare)):
-        model = load_gava(name)
-        if model.n_vertices != dataset.mesh.n_vertices:
-            raise OptionError(
-                f"{name} animates {model.n_vertices} vertices, {options.data} has {dataset.mesh.n_vertices}"
-            )
+        model = topology_of(load_gava(name), dataset)
         models[describe(name, model)] = model
     head = load_head(dataset.head) if dataset.head else None
     masks = masks_of_head(head)
@@ -119,7 +115,25 @@ def load_gava(name: str) -> Gava:
     """A checkpoint by name or folder."""
     from meshanim.animator import Animator
 
-    return Animator.from_pretrained(name).model
+    return Animator.from_pretrained(name).network
+
+
+def topology_of(model: Gava, dataset: MeshanimDataset) -> Gava:
+    """The network on its first topology with as many vertices as a data set.
+
+    Raises
+    ------
+    OptionError
+        If it has none.
+    """
+    views = [model.on(k) for k in range(model.n_topologies)]
+    for view in views:
+        if view.n_vertices == dataset.mesh.n_vertices:
+            return view
+    counts = " or ".join(str(view.n_vertices) for view in views)
+    raise OptionError(
+        f"the checkpoint animates {counts} vertices, {dataset.directory} has {dataset.mesh.n_vertices}"
+    )
 
 
 def describe(name: str, model: Gava) -> str:

@@ -17,7 +17,7 @@ from meshanim.files import written_whole
 from meshanim.heads import load_head
 from meshanim.models.gava import Gava
 from meshanim.render import portrait_camera, render_mesh
-from meshanim.training.gava_evaluation import describe, load_gava
+from meshanim.training.gava_evaluation import describe, load_gava, topology_of
 
 __all__ = ["GavaMapsOptions", "VertexMaps", "draw_gava_maps", "vertex_maps"]
 
@@ -162,11 +162,7 @@ def _drawn(
     moments: Sequence[int],
     options: GavaMapsOptions,
 ) -> UInt8[np.ndarray, "height width 3"]:
-    model = load_gava(name)
-    if model.n_vertices != dataset.mesh.n_vertices:
-        raise OptionError(
-            f"{name} animates {model.n_vertices} vertices, {options.data} has {dataset.mesh.n_vertices}"
-        )
+    model = topology_of(load_gava(name), dataset)
     config, info = model.config, sequence.info
     features, mel = load_encoder(config.encoder)(sequence.audio).float(), log_mel(sequence.audio)
 

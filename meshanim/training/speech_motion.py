@@ -1,38 +1,35 @@
-"""Speech with mesh motion, as windows of consecutive frames for training."""
+"""Speech with mesh motion, clip by clip on disk, as what a training batch is made of."""
 
-import hashlib
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Float64, Int
+from jaxtyping import Float32, Float64, Int
 from torch import Tensor
 from tqdm import tqdm
 
-from meshanim.audio import SpeechEncoder, Waveform, log_mel
-from meshanim.audio.augmentation import degrade
 from meshanim.datasets.meshanim_format import MeshanimDataset, SequenceInfo
-from meshanim.errors import FileFormatError, OptionError
-from meshanim.files import written_whole
+from meshanim.errors import OptionError
+from meshanim.training.array_rows import ArrayRows, rows_on_disk
+from meshanim.training.feature_cache import FeatureCache, Voices
 
-__all__ = ["Clip", "FeatureCache", "SpeechTracks", "WindowSampler", "load_clips"]
+__all__ = ["MEL_RATE", "Clip", "SpeechTracks", "load_clips"]
 
 MEL_RATE = 100.0
-WAVEFORM_RATE = 16000
 
 
 @dataclass(frozen=True)
 class Clip:
-    """One sequence, its motion on disk, its features in memory.
+    """One sequence; its motion and its features stay on disk.
 
     Parameters
     ----------
     info : SequenceInfo
         Text, phonemes, emotion.
     subject : int
-        Row among the templates of the data set.
+        Row among the templates.
     style : int
         Row among the subjects that have a style, or -1.
     emotion : int
@@ -40,10 +37,10 @@ class Clip:
     intensity : float
         Of the emotion.
     vertices : (T, V, 3)
-        Zero pose, metres; may be memory-mapped.
+        Zero pose, metres; slices of it are arrays.
     pose : (T, 3)
         Radians.
-    features, mels : sequence of (steps, dim) half tensors
+    features, mels : sequence of (steps, dim) half-precision rows
         Of the clean sound, then of its degraded variants.
     """
 
@@ -52,84 +49,13 @@ class Clip:
     style: int
     emotion: int
     intensity: float
-    vertices: Float32[np.ndarray, "frames vertices 3"]
+    vertices: Float32[np.ndarray, "frames vertices 3"] | ArrayRows
     pose: Float32[np.ndarray, "frames 3"]
-    features: Sequence[Float[Tensor, "steps dim"]]
-    mels: Sequence[Float[Tensor, "mel_steps bands"]]
+    features: Sequence[ArrayRows]
+    mels: Sequence[ArrayRows]
 
     def __len__(self) -> int:
         return len(self.pose)
-
-
-class FeatureCache:
-    """Speech features of sound files on disk, for one encoder, clean and degraded.
-
-    An entry belongs to its sound and to what the encoder gives for a fixed noise: a changed file or a
-    retrained encoder starts anew.
-
-    Parameters
-    ----------
-    directory : Path
-        Gets a folder an encoder; made where it is missing.
-    encoder : SpeechEncoder
-        Frozen.
-    seed : int
-        Of the degradation.
-    """
-
-    def __init__(self, directory: str | Path, encoder: SpeechEncoder, seed: int = 0):
-        noise = np.random.default_rng(0).normal(0, 0.1, WAVEFORM_RATE // 2).astype(np.float32)
-        probe = encoder(Waveform(noise, WAVEFORM_RATE)).numpy().round(2)
-        mark = hashlib.blake2b(probe.tobytes(), digest_size=6).hexdigest()
-        name = "".join(c if c.isalnum() else "-" for c in encoder.name)
-        self.folder = Path(directory) / f"{name}-{mark}-{seed}"
-        self.folder.mkdir(parents=True, exist_ok=True)
-        self.encoder, self.seed = encoder, seed
-
-    def get(
-        self, name: str, audio: Waveform, variant: int, others: Sequence[np.ndarray]
-    ) -> tuple[Tensor, Tensor]:
-        """Features and log-mel of a variant: 0 is the clean sound, others are degraded in their own ways.
-
-        Parameters
-        ----------
-        name : str
-            Of the sequence.
-        audio : Waveform
-            Its sound.
-        variant : int
-            Which.
-        others : sequence of (samples,) arrays
-            Voices that noise may be made of, 16 kHz.
-        """
-        sound = hashlib.blake2b(audio.samples.tobytes(), digest_size=6).hexdigest()
-        path = self.folder / f"{name}-{sound}.{variant}.npz"
-        if not path.exists():
-            if variant:
-                digest = hashlib.blake2b(f"{name}.{variant}.{self.seed}".encode(), digest_size=8).digest()
-                audio = _degraded(audio, np.random.default_rng(int.from_bytes(digest)), others)
-            with written_whole(path) as temporary, open(temporary, "wb") as file:
-                np.savez(
-                    file,
-                    features=self.encoder(audio).numpy().astype(np.float16),
-                    mel=log_mel(audio).numpy().astype(np.float16),
-                )
-        try:
-            with np.load(path) as archive:
-                return torch.from_numpy(archive["features"]), torch.from_numpy(archive["mel"])
-        except (OSError, ValueError, KeyError) as error:
-            raise FileFormatError(f"{path} is damaged ({error}): delete it") from error
-
-
-def _degraded(audio: Waveform, generator: np.random.Generator, others: Sequence[np.ndarray]) -> Waveform:
-    def babble(rng: np.random.Generator, count: int) -> np.ndarray:
-        voices = [others[int(rng.integers(len(others)))] for _ in range(int(rng.integers(3, 7)))]
-        shifts = [int(rng.integers(len(voice))) for voice in voices]
-        mixed = np.stack([np.resize(np.roll(v, s), count) for v, s in zip(voices, shifts)])
-        return mixed.sum(0).astype(np.float32)
-
-    samples = audio.resampled(WAVEFORM_RATE).samples
-    return Waveform(degrade(samples[None], generator, babble)[0].numpy(), WAVEFORM_RATE)
 
 
 def load_clips(
@@ -140,8 +66,12 @@ def load_clips(
     emotions: Sequence[str],
     variants: int = 0,
     progress: bool = True,
+    share: int = 0,
+    shares: int = 1,
 ) -> list[Clip]:
-    """Clips of a data set with cached features.
+    """Clips of a data set; features that are missing in the cache are made.
+
+    Several processes may do this at once: each begins with its share and takes over what nobody works on.
 
     Parameters
     ----------
@@ -157,85 +87,56 @@ def load_clips(
         Degraded variants of each sound beside the clean one.
     progress : bool
         Whether to show a bar.
+    share, shares : int
+        Which process of how many this is.
     """
     people = list(dataset.subjects)
-    sequences = [dataset[name] for name in names]
-    voices = [
-        sequence.audio.resampled(WAVEFORM_RATE).samples for sequence in sequences[:: max(1, len(names) // 64)]
-    ]
-    clips = []
-    for sequence in tqdm(sequences, unit="clip", desc="features", disable=not progress):
-        info = sequence.info
-        if info.emotion not in emotions:
-            raise OptionError(
-                f"{info.name} has emotion {info.emotion!r}; the network knows {', '.join(emotions)}"
-            )
-        features, mels = zip(*(cache.get(info.name, sequence.audio, k, voices) for k in range(variants + 1)))
-        clips.append(
-            Clip(
+    voices = Voices(dataset, names)
+    clips: dict[str, Clip] = {}
+    first = share * len(names) // shares
+    left = deque([*names[first:], *names[:first]])
+    busy = 0
+    with tqdm(total=len(names), unit="clip", desc="features", disable=not progress) as bar:
+        while left:
+            name = left.popleft()
+            sequence = dataset[name]
+            info = sequence.info
+            if info.emotion not in emotions:
+                raise OptionError(
+                    f"{info.name} has emotion {info.emotion!r}; the network knows {', '.join(emotions)}"
+                )
+            # What another process makes comes last; when nothing else is left, wait for it.
+            tracks = cache.tracks(name, sequence.audio, variants, voices, wait=busy >= len(left))
+            if tracks is None:
+                left.append(name)
+                busy += 1
+                continue
+            busy = 0
+            features, mels = zip(*tracks)
+            clips[name] = Clip(
                 info,
                 people.index(info.subject),
                 styles.index(info.subject) if info.subject in styles else -1,
                 emotions.index(info.emotion),
                 info.intensity,
-                sequence.vertices,
+                rows_on_disk(sequence.vertices),
                 sequence.pose,
                 features,
                 mels,
             )
-        )
-    return clips
-
-
-class WindowSampler:
-    """Which windows of consecutive frames a batch has, as a function of its number.
-
-    Every epoch is a new permutation of all windows, cut at a new offset.
-
-    Parameters
-    ----------
-    lengths : sequence of int
-        Frames of each clip; clips shorter than a window are left out.
-    frames : int
-        Consecutive frames a window.
-    windows : int
-        Windows a batch.
-    seed : int
-        Of the order.
-    """
-
-    def __init__(self, lengths: Sequence[int], frames: int, windows: int, seed: int = 0):
-        self.lengths, self.frames, self.windows, self.seed = list(lengths), frames, windows, seed
-        self.slots = [(clip, k) for clip, n in enumerate(lengths) for k in range(n // frames)]
-        if not self.slots:
-            raise OptionError(f"no clip has the {frames} consecutive frames of a window")
-        self._epoch: tuple[int, Tensor, Tensor] | None = None
-
-    def picks(self, number: int) -> list[tuple[int, int]]:
-        """(clip, first frame) of each window of a batch."""
-        picks = []
-        for position in range(number * self.windows, (number + 1) * self.windows):
-            epoch, place = divmod(position, len(self.slots))
-            if self._epoch is None or self._epoch[0] != epoch:
-                generator = torch.Generator().manual_seed(self.seed * 1_000_003 + epoch)
-                order = torch.randperm(len(self.slots), generator=generator)
-                offsets = torch.randint(self.frames, (len(self.lengths),), generator=generator)
-                self._epoch = (epoch, order, offsets)
-            _, order, offsets = self._epoch
-            clip, k = self.slots[int(order[place])]
-            first = min(k * self.frames + int(offsets[clip]), self.lengths[clip] - self.frames)
-            picks.append((clip, first))
-        return picks
+            bar.update()
+    return [clips[name] for name in names]
 
 
 class SpeechTracks:
-    """The feature tracks of all clips end to end, read as windows around many frames at once.
+    """The feature tracks of all clips, read as windows around many frames at once.
 
-    The same windows as `feature_windows` gives clip by clip.
+    The same windows as `feature_windows` gives clip by clip; only the part of a track that a batch needs is
+    read.
 
     Parameters
     ----------
-    tracks : sequence of sequence of (steps, dim) tensors
+    tracks : sequence of sequence of (steps, dim) rows
         Variants of each clip; all clips have as many.
     rate : float
         Feature frames a second.
@@ -243,13 +144,10 @@ class SpeechTracks:
         Feature frames a window.
     """
 
-    def __init__(self, tracks: Sequence[Sequence[Float[Tensor, "_ dim"]]], rate: float, width: int):
-        flat = [track for variants in tracks for track in variants]
+    def __init__(self, tracks: Sequence[Sequence[ArrayRows | np.ndarray]], rate: float, width: int):
+        self.tracks = [track for variants in tracks for track in variants]
         self.rate, self.width, self.variants = rate, width, len(tracks[0])
-        lengths = torch.tensor([len(track) for track in flat])
-        self.last = lengths - 1
-        self.start = lengths.cumsum(0) - lengths
-        self.values = torch.cat(flat)
+        self.last = torch.tensor([len(track) for track in self.tracks]) - 1
 
     def windows(
         self, clips: Int[Tensor, " batch"], variants: Int[Tensor, " batch"], times: Float64[Tensor, " batch"]
@@ -261,7 +159,17 @@ class SpeechTracks:
         last = self.last[track][:, None]
         position = torch.minimum(position.clamp_min(0), last.double())
         lower = position.floor().long()
+        upper = torch.minimum(lower + 1, last)
         weight = (position - lower).float()[..., None]
-        start = self.start[track][:, None]
-        below = self.values[start + lower].float()
-        return below.lerp(self.values[start + torch.minimum(lower + 1, last)].float(), weight)
+        below = above = None
+        for number in track.unique().tolist():
+            rows = track == number
+            first, end = int(lower[rows].min()), int(upper[rows].max()) + 1
+            part = torch.from_numpy(self.tracks[number][first:end]).float()
+            if below is None or above is None:
+                below = part.new_empty(*position.shape, part.shape[1])
+                above = torch.empty_like(below)
+            below[rows], above[rows] = part[lower[rows] - first], part[upper[rows] - first]
+        assert below is not None
+        assert above is not None
+        return below.lerp(above, weight)

@@ -7,7 +7,9 @@ run takes the same steps as one that was never interrupted.
 import json
 import math
 import shutil
-from collections.abc import Mapping
+import time
+from collections.abc import Generator, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, Protocol, runtime_checkable
@@ -18,12 +20,13 @@ from accelerate.utils import DistributedDataParallelKwargs
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
+from torch.utils.data import DataLoader, Dataset, get_worker_info
 from tqdm import tqdm
 
-from meshanim.errors import FileFormatError, OptionError
+from meshanim.errors import FileFormatError, MeshanimError, OptionError
 from meshanim.files import written_whole
 
-__all__ = ["TrainConfig", "Trainer", "TrainingTask", "learning_rate_factor"]
+__all__ = ["TrainConfig", "Trainer", "TrainingTask", "last_checkpoint", "learning_rate_factor"]
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,8 @@ class TrainConfig:
         Steps between lines of the log, and between checkpoints.
     keep : int
         Checkpoints kept, the newest.
+    workers : int
+        Processes that make batches ahead of time, for each training process; 0 makes them between steps.
 
     Raises
     ------
@@ -76,11 +81,14 @@ class TrainConfig:
     log_every: int = 50
     save_every: int = 1000
     keep: int = 2
+    workers: int = 0
 
     def __post_init__(self):
         for name in ("steps", "accumulation", "log_every", "save_every", "keep"):
             if getattr(self, name) < 1:
                 raise OptionError(f"{name} must be at least 1, not {getattr(self, name)}")
+        if self.workers < 0:
+            raise OptionError(f"workers must not be negative, not {self.workers}")
         if not self.learning_rate > 0:
             raise OptionError(f"learning_rate must be positive, not {self.learning_rate}")
         if not 0 <= self.ema < 1:
@@ -91,8 +99,12 @@ class TrainConfig:
 class TrainingTask(Protocol):
     """What a trainer needs to know of a model's data and loss."""
 
-    def batch(self, number: int) -> Mapping[str, Any]:
-        """The batch of a number: the same one whenever it is asked for. Tensors are moved to the device."""
+    def batch(self, number: int, share: int = 0, shares: int = 1) -> Mapping[str, Any]:
+        """A share of the batch of a number: the same one whenever it is asked for.
+
+        The `shares` processes of a run take one each, all of the same size: together the batch is as many
+        times as large. Tensors are moved to the device.
+        """
 
     def loss(self, model: nn.Module, batch: Mapping[str, Any]) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss of a batch, and its terms for the log."""
@@ -109,6 +121,47 @@ def learning_rate_factor(config: TrainConfig, step: int) -> float:
         return 1.0
     progress = (step - config.warmup) / max(config.steps - config.warmup, 1)
     return 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
+
+
+def last_checkpoint(directory: str | Path) -> Path | None:
+    """The newest checkpoint of a run's folder; None where there is none."""
+    return max((Path(directory) / "checkpoints").glob("[0-9]*"), default=None)
+
+
+class _Batches(Dataset):
+    """One process's batches by number, for worker processes: an error that a user can mend is given back."""
+
+    def __init__(self, task: TrainingTask, share: int, shares: int):
+        self.task, self.share, self.shares = task, share, shares
+
+    def __getitem__(self, number: int) -> Mapping[str, Any] | MeshanimError:
+        if get_worker_info() is None:
+            return self.task.batch(number, self.share, self.shares)
+        try:
+            return self.task.batch(number, self.share, self.shares)
+        except MeshanimError as error:
+            return error
+
+
+class _Clock:
+    """Time of training steps, and the share of it that was spent waiting for data."""
+
+    def __init__(self) -> None:
+        self.start, self.waited, self.steps = time.perf_counter(), 0.0, 0
+
+    @contextmanager
+    def waiting(self) -> Iterator[None]:
+        begun = time.perf_counter()
+        yield
+        self.waited += time.perf_counter() - begun
+        self.steps += 1
+
+    def read(self) -> dict[str, float]:
+        """Since the last reading: seconds a batch, and the share of them for data."""
+        passed = max(time.perf_counter() - self.start, 1e-9)
+        values = {"seconds": passed / max(self.steps, 1), "data_share": self.waited / passed}
+        self.start, self.waited, self.steps = time.perf_counter(), 0.0, 0
+        return values
 
 
 class Trainer:
@@ -188,12 +241,14 @@ class Trainer:
             disable=not (progress and accelerator.is_main_process),
         )
         self.model.train()
+        clock = _Clock()
+        batches = self._batches(last)
         while self.step < last:
-            logs = self._optimizer_step()
+            logs = self._optimizer_step(batches, clock)
             self.step += 1
             bar.update()
             if self.step % config.log_every == 0 or self.step == last:
-                values = {name: float(value) for name, value in logs.items()}
+                values = self._logged(logs) | clock.read()
                 if not all(map(math.isfinite, values.values())):
                     raise FloatingPointError(f"the loss of step {self.step} is not finite: {values}")
                 bar.set_postfix({name: f"{value:.4g}" for name, value in values.items()})
@@ -202,6 +257,7 @@ class Trainer:
                         writer.add_scalar(name, value, self.step)
             if self.step % config.save_every == 0 or self.step == last:
                 self.save_checkpoint()
+        batches.close()
         bar.close()
         if writer is not None:
             writer.close()
@@ -210,14 +266,43 @@ class Trainer:
         accelerator.wait_for_everyone()
         return self.bare
 
-    def _optimizer_step(self) -> dict[str, Tensor]:
+    def _logged(self, logs: Mapping[str, Tensor]) -> dict[str, float]:
+        """Means over the processes."""
+        values = torch.stack([value.float() for value in logs.values()])
+        reduced = self.accelerator.reduce(values, reduction="mean")
+        assert isinstance(reduced, Tensor)
+        return dict(zip(logs, reduced.tolist(), strict=True))
+
+    def _batches(self, last: int) -> Generator[Mapping[str, Any], None, None]:
+        """This process's batches from here to step `last`, made in worker processes if there are any."""
+        accumulation, accelerator = self.config.accumulation, self.accelerator
+        numbers = range(self.step * accumulation, last * accumulation)
+        source = _Batches(self.task, accelerator.process_index, accelerator.num_processes)
+        if not self.config.workers or not numbers:
+            yield from map(source.__getitem__, numbers)
+            return
+        loader = DataLoader(
+            source,
+            batch_size=None,
+            sampler=numbers,
+            num_workers=self.config.workers,
+            prefetch_factor=4,
+            pin_memory=accelerator.device.type == "cuda",
+            multiprocessing_context="spawn",
+        )
+        for batch in loader:
+            if isinstance(batch, MeshanimError):
+                raise batch
+            yield batch
+
+    def _optimizer_step(self, batches: Iterator[Mapping[str, Any]], clock: "_Clock") -> dict[str, Tensor]:
         config, accelerator = self.config, self.accelerator
         for group in self.optimizer.param_groups:
             group["lr"] = config.learning_rate * learning_rate_factor(config, self.step)
         logs: dict[str, Tensor] = {}
-        for part in range(config.accumulation):
-            number = (self.step * config.accumulation + part) * accelerator.num_processes
-            batch = self._to_device(self.task.batch(number + accelerator.process_index))
+        for _ in range(config.accumulation):
+            with clock.waiting():
+                batch = self._to_device(next(batches))
             with accelerator.accumulate(self.model):
                 with accelerator.autocast():
                     loss, terms = self.task.loss(self.model, batch)
@@ -238,7 +323,7 @@ class Trainer:
 
     def _to_device(self, batch: Mapping[str, Any]) -> dict[str, Any]:
         device = self.accelerator.device
-        return {k: v.to(device) if isinstance(v, Tensor) else v for k, v in batch.items()}
+        return {k: v.to(device, non_blocking=True) if isinstance(v, Tensor) else v for k, v in batch.items()}
 
     def _writer(self):
         if not self.accelerator.is_main_process:
@@ -299,21 +384,21 @@ class Trainer:
         FileFormatError
             If it is damaged.
         """
-        found = sorted((self.directory / "checkpoints").glob("[0-9]*"))
-        if not found:
+        found = last_checkpoint(self.directory)
+        if found is None:
             return False
         try:
-            described = json.loads((found[-1] / "trainer.json").read_text())
-            tensors = load_file(found[-1] / "trainer.safetensors")
+            described = json.loads((found / "trainer.json").read_text())
+            tensors = load_file(found / "trainer.safetensors")
         except (OSError, ValueError, SafetensorError) as error:
-            raise FileFormatError(f"{found[-1]} is not a checkpoint of a training run: {error}") from error
+            raise FileFormatError(f"{found} is not a checkpoint of a training run: {error}") from error
         fixed = asdict(self.config)
-        for name in ("log_every", "save_every", "keep"):
+        for name in ("log_every", "save_every", "keep", "workers"):
             fixed.pop(name), described["config"].pop(name, None)
         changed = [name for name in fixed if described["config"].get(name) != fixed[name]]
         if changed or described["processes"] != self.accelerator.num_processes:
             raise OptionError(
-                f"{found[-1]} was made with another {', '.join(changed) or 'number of processes'}: "
+                f"{found} was made with another {', '.join(changed) or 'number of processes'}: "
                 "use the same options, or another directory"
             )
 

@@ -4,26 +4,32 @@ VOCA initialises its decoder with principal components; here they become the sca
 embedding gives, and the codes that speech modulates them with. Only the start: all weights go on learning.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from accelerate import PartialState
 from jaxtyping import Float, Float32
+from safetensors.torch import save_file
 from torch import Tensor, nn
-from tqdm import tqdm
 
 from meshanim.errors import OptionError
 from meshanim.models.gava import Gava
 from meshanim.models.gava_parts import GlobalDecoder, TransformerDecoder
+from meshanim.training.gava_task import GavaTask, MixedTask
 from meshanim.training.losses import MILLIMETRES
+from meshanim.training.sampling import WindowSampler
 from meshanim.training.speech_motion import Clip
-
-if TYPE_CHECKING:
-    from meshanim.training.gava import GavaTask
+from meshanim.training.trainer import TrainConfig, Trainer
 
 __all__ = ["MotionComponents", "WarmStart", "motion_components", "warm_start"]
+
+FRAMES = 4
+"""Consecutive frames of the windows that the speech encoder learns from."""
+FITTED = "fitted.safetensors"
 
 
 @dataclass(frozen=True)
@@ -35,9 +41,9 @@ class WarmStart:
     steps : int
         Steps in which the speech encoder learns the components; 0 for a random start.
     batch_windows : int
-        Windows a step.
+        Windows a step, on each process.
     components : int
-        Principal components; at most a third of the network's rank.
+        Principal components, shared out among the topologies; at most a third of the network's rank.
     learning_rate : float
         Peak, cosine to zero, of both fits.
     field_steps : int
@@ -102,15 +108,38 @@ def motion_components(
 
 def warm_start(
     model: Gava,
-    task: "GavaTask",
-    components: MotionComponents,
+    task: MixedTask,
+    components: Sequence[MotionComponents],
     options: WarmStart,
-    device: torch.device,
+    directory: Path,
+    train: TrainConfig,
+    cpu: bool = False,
     progress: bool = True,
 ) -> None:
     """Fit the speech encoder to the components' coefficients, the vertex embedding to their fields.
 
     The attention blocks start as identities. After it, the network gives the components' share of the motion.
+    Every topology has components and codes of its own, which its vertices alone answer to. Both fits are runs
+    of the trainer: interrupted ones go on where they were.
+
+    Parameters
+    ----------
+    model : Gava
+        Changed in place, and moved to the device of the run.
+    task : MixedTask
+        The data, by topology.
+    components : sequence of MotionComponents
+        One a topology.
+    options : WarmStart
+        Steps, components, learning rate.
+    directory : Path
+        Gets the folders of both fits.
+    train : TrainConfig
+        Of the run to come: seed, precision, workers, and how often to log and save.
+    cpu : bool
+        Stay on the CPU.
+    progress : bool
+        Whether to show bars.
 
     Raises
     ------
@@ -118,30 +147,135 @@ def warm_start(
         If the network's rank has no room for the components.
     """
     config = model.config
-    count = len(components.scale)
-    if isinstance(model.decoder, TransformerDecoder) and 3 * count > config.rank:
-        raise OptionError(f"{count} components need a rank of at least {3 * count}, not {config.rank}")
-    readout = nn.Linear(2 * config.channels, count).to(device)
-    _fit_speech(model, readout, task, components, options, device, progress)
+    counts = [len(one.scale) for one in components]
+    total = sum(counts)
+    if isinstance(model.decoder, TransformerDecoder) and 3 * total > config.rank:
+        raise OptionError(f"{total} components need a rank of at least {3 * total}, not {config.rank}")
+    slots = [slice(sum(counts[:k]), sum(counts[: k + 1])) for k in range(len(counts))]
+    device = PartialState(cpu=cpu).device
+    model.to(device)
+    fits = replace(
+        train,
+        steps=options.steps,
+        learning_rate=options.learning_rate,
+        warmup=0,
+        schedule="cosine",
+        weight_decay=1e-2,
+        gradient_clip=1.0,
+        accumulation=1,
+        ema=0.0,
+        keep=1,
+    )
+    torch.manual_seed(train.seed)
+    readout = nn.Linear(2 * config.channels, total).to(device)
+    fit = Trainer(
+        _SpeechReader(model, readout),
+        _SpeechFit(model, task, components, slots, options.batch_windows, train.seed),
+        fits,
+        directory / "speech",
+        cpu=cpu,
+    )
+    fit.resume()
+    fit.run(progress=progress)
     with torch.no_grad():
         if isinstance(model.decoder, GlobalDecoder):
-            _start_global(model, readout, components)
+            _start_global(model, readout, components[0])
             return
-        _start_heads(model, readout, count)
-    _fit_fields(model, task.templates.to(device), components, options, progress)
+        _start_heads(model, readout, total)
+    fit = Trainer(
+        _FieldEmbedder(model),
+        _FieldFit(model, task, components, slots),
+        replace(fits, steps=options.field_steps, gradient_clip=0.0, workers=0),
+        directory / "fields",
+        cpu=cpu,
+    )
+    fit.resume()
+    fit.run(progress=progress)
 
 
-def _fit_speech(
-    model: Gava,
-    readout: nn.Linear,
-    task: "GavaTask",
-    components: MotionComponents,
-    options: WarmStart,
-    device: torch.device,
-    progress: bool,
-) -> None:
+class _SpeechReader(nn.Module):
+    """The parts of a network that turn speech into codes and a pose, with a linear layer to coefficients."""
+
+    def __init__(self, model: Gava, readout: nn.Linear):
+        super().__init__()
+        self.speech, self.readout = model.speech, readout
+        self.subject_styles, self.emotion_styles = model.subject_styles, model.emotion_styles
+        turn = model.decoder.pose if config_pose(model) else None
+        if turn is not None and model.pose_feature is not None:
+            self.pose_feature, self.turn = model.pose_feature, turn
+        self._whole = [model]  # in a list, so that its other parameters are not this module's
+
+    def forward(
+        self, window: Tensor, mel: Tensor, style: Tensor, emotion: Tensor, intensity: Tensor
+    ) -> tuple[Tensor, Tensor | None]:
+        (model,) = self._whole
+        style = model.style(style, emotion, intensity)
+        window = (window - model.feature_mean) / model.feature_scale
+        coefficients = self.readout(self.speech(window, style))
+        if not hasattr(self, "turn"):
+            return coefficients, None
+        # The LSTM costs more than all the rest: a quarter of the frames is enough for it.
+        mel = (mel[::4] - model.mel_mean) / model.mel_scale
+        turned = self.turn(self.pose_feature(mel, style[::4]))
+        return coefficients, model.pose_mean + turned * model.pose_scale
+
+
+class _SpeechFit:
+    """Windows of speech with the coefficients of their motion."""
+
+    def __init__(
+        self,
+        model: Gava,
+        task: MixedTask,
+        components: Sequence[MotionComponents],
+        slots: Sequence[slice],
+        windows: int,
+        seed: int,
+    ):
+        self.tasks, self.turns, self.slots = task.tasks, task.turns, slots
+        # The loss of a coefficient is what it contributes to the mean squared distance of the vertices.
+        self.weights = [
+            torch.from_numpy(one.scale * MILLIMETRES).square() / one.modes.shape[1] for one in components
+        ]
+        self.targets = [_coefficients(one, task) for one, task in zip(components, task.tasks, strict=True)]
+        self.frames = FRAMES
+        self.samplers = [
+            WindowSampler([len(clip) for clip in one.clips], FRAMES, windows, seed) for one in task.tasks
+        ]
+
+    def batch(self, number: int, share: int = 0, shares: int = 1) -> dict[str, Any]:
+        k, own = self.turns.of(number)
+        spans = self.samplers[k].spans(own, share, shares)
+        parts = [(span.clip, slice(span.first, span.first + span.frames)) for span in spans]
+        clips = self.tasks[k].clips
+        return self.tasks[k].speech(spans) | {
+            "target": torch.cat([self.targets[k][clip][frames] for clip, frames in parts]),
+            "pose": torch.cat([torch.from_numpy(clips[clip].pose[frames]) for clip, frames in parts]),
+            "topology": k,
+        }
+
+    def loss(self, model: nn.Module, batch: Mapping[str, Any]) -> tuple[Tensor, dict[str, Tensor]]:
+        inputs = {name: batch[name] for name in ("window", "mel", "style", "emotion", "intensity")}
+        coefficients, pose = model(**inputs)
+        k = batch["topology"]
+        task, weight = self.tasks[k], self.weights[k].to(coefficients.device)
+        error = coefficients[:, self.slots[k]] - batch["target"]
+        moved = error.unflatten(0, (-1, self.frames)).diff(dim=1)
+        loss = (error.square() * weight).sum(-1).mean()
+        loss = loss + task.weights.velocity * (moved.square() * weight).sum(-1).mean()
+        if pose is not None:
+            missed = torch.linalg.vector_norm(pose - batch["pose"][::4], dim=-1).mean()
+            loss = loss + float(task.posed) * missed
+        return loss, {}
+
+    def save(self, model: nn.Module, directory: Path) -> None:
+        save_file({n: t.contiguous() for n, t in model.state_dict().items()}, directory / FITTED)
+
+
+def _coefficients(components: MotionComponents, task: GavaTask) -> list[Float[Tensor, "frames components"]]:
+    """The coefficients of every clip, 64 frames of motion in memory at a time."""
     templates = task.templates.numpy()
-    targets = [
+    return [
         torch.cat(
             [
                 components.coefficients(np.asarray(clip.vertices[k : k + 64]) - templates[clip.subject])
@@ -150,44 +284,6 @@ def _fit_speech(
         )
         for clip in task.clips
     ]
-    poses = [torch.from_numpy(clip.pose) for clip in task.clips]
-    # The loss of a coefficient is what it contributes to the mean squared distance of the vertices.
-    weight = torch.from_numpy(components.scale * MILLIMETRES).square() / components.modes.shape[1]
-    weight = weight.to(device)
-    windows, task.sampler.windows = task.sampler.windows, options.batch_windows
-    parameters = [*model.speech.parameters(), *readout.parameters(), *model.subject_styles.parameters()]
-    parameters += model.emotion_styles.parameters()
-    turn = model.decoder.pose if config_pose(model) else None
-    if turn is not None and model.pose_feature is not None:
-        parameters += [*model.pose_feature.parameters(), *turn.parameters()]
-    optimizer = torch.optim.AdamW(parameters, lr=options.learning_rate, weight_decay=1e-2)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, options.steps)
-    bar = tqdm(range(options.steps), unit="step", desc="warm start: speech", disable=not progress)
-    for number in bar:
-        batch, picks = task.speech(number)
-        batch = {name: value.to(device) for name, value in batch.items()}
-        span = [(c, slice(first, first + task.frames)) for c, first in picks]
-        target = torch.cat([targets[c][s] for c, s in span]).to(device)
-        style = model.style(batch["style"], batch["emotion"], batch["intensity"])
-        window = (batch["window"] - model.feature_mean) / model.feature_scale
-        error = readout(model.speech(window, style)) - target
-        moved = error.unflatten(0, (-1, task.frames)).diff(dim=1)
-        loss = (error.square() * weight).sum(-1).mean()
-        loss = loss + task.weights.velocity * (moved.square() * weight).sum(-1).mean()
-        if turn is not None and model.pose_feature is not None:
-            # The LSTM costs more than all the rest: a quarter of the frames is enough for it.
-            mel = (batch["mel"][::4] - model.mel_mean) / model.mel_scale
-            pose = model.pose_mean + turn(model.pose_feature(mel, style[::4])) * model.pose_scale
-            true = torch.cat([poses[c][s] for c, s in span])[::4].to(device)
-            loss = loss + torch.linalg.vector_norm(pose - true, dim=-1).mean()
-        optimizer.zero_grad()
-        loss.backward()
-        nn.utils.clip_grad_norm_(parameters, 1.0)
-        optimizer.step()
-        schedule.step()
-        if number % 50 == 0:
-            bar.set_postfix(loss=f"{float(loss):.4g}")
-    task.sampler.windows = windows
 
 
 def config_pose(model: Gava) -> bool:
@@ -233,30 +329,50 @@ def _start_global(model: Gava, readout: nn.Linear, components: MotionComponents)
     layer.weight[:, :used] = tokens[:used].flatten(1).T.to(layer.weight)
 
 
-def _fit_fields(
-    model: Gava,
-    templates: Float[Tensor, "subjects vertices 3"],
-    components: MotionComponents,
-    options: WarmStart,
-    progress: bool,
-) -> None:
-    surface = model.surface
-    fields = torch.from_numpy(components.modes * components.scale[:, None, None])
-    target = (fields[:, surface.vertices.cpu()] / surface.amplitude.cpu()[:, None]).to(surface.amplitude)
-    target = target.permute(1, 0, 2).flatten(1)
-    weight = surface.amplitude.square()[:, None] / surface.amplitude.square().mean()
-    identities = surface.identity(templates)
-    parameters = list(model.embedding.parameters())
-    optimizer = torch.optim.AdamW(parameters, lr=options.learning_rate)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, options.field_steps)
-    bar = tqdm(range(options.field_steps), unit="step", desc="warm start: fields", disable=not progress)
-    for number in bar:
-        subject = identities[number % len(identities)][None]
-        error = model.embedding(surface.descriptors, subject)[0, :, : target.shape[1]] - target
-        loss = (error.square() * weight).sum(-1).mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        schedule.step()
-        if number % 50 == 0:
-            bar.set_postfix(missed=f"{float(loss / (target.square() * weight).sum(-1).mean()):.4g}")
+class _FieldEmbedder(nn.Module):
+    """The vertex embedding of a network, subject by subject of any topology."""
+
+    def __init__(self, model: Gava):
+        super().__init__()
+        self.embedding = model.embedding
+
+    def forward(self, descriptors: Tensor, identity: Tensor) -> Tensor:
+        return self.embedding(descriptors, identity)
+
+
+class _FieldFit:
+    """Subjects with the fields of their topology's components; those of other topologies are zero there."""
+
+    def __init__(
+        self, model: Gava, task: MixedTask, components: Sequence[MotionComponents], slots: Sequence[slice]
+    ):
+        self.turns = task.turns
+        self.surfaces = [model.on(k).surface for k in range(model.n_topologies)]
+        self.identities, self.targets, self.weights = [], [], []
+        total = slots[-1].stop
+        for surface, one, part, slot in zip(self.surfaces, task.tasks, components, slots, strict=True):
+            self.identities.append(surface.identity(one.templates.to(surface.template)))
+            fields = torch.from_numpy(part.modes * part.scale[:, None, None])
+            own = fields[:, surface.vertices.cpu()] / surface.amplitude.cpu()[:, None]
+            target = own.new_zeros(total, *own.shape[1:])
+            target[slot] = own
+            self.targets.append(target.permute(1, 0, 2).flatten(1).to(surface.amplitude))
+            self.weights.append(surface.amplitude.square()[:, None] / surface.amplitude.square().mean())
+
+    def batch(self, number: int, share: int = 0, shares: int = 1) -> dict[str, Any]:
+        k, own = self.turns.of(number)
+        # The same on all processes: one subject is all that one process would see.
+        return {
+            "descriptors": self.surfaces[k].descriptors,
+            "identity": self.identities[k][own % len(self.identities[k])][None],
+            "topology": k,
+        }
+
+    def loss(self, model: nn.Module, batch: Mapping[str, Any]) -> tuple[Tensor, dict[str, Tensor]]:
+        target, weight = self.targets[batch["topology"]], self.weights[batch["topology"]]
+        found = model(batch["descriptors"], batch["identity"])[0, :, : target.shape[1]]
+        loss = ((found - target).square() * weight).sum(-1).mean()
+        return loss, {"missed": loss / (target.square() * weight).sum(-1).mean()}
+
+    def save(self, model: nn.Module, directory: Path) -> None:
+        save_file({n: t.contiguous() for n, t in model.state_dict().items()}, directory / FITTED)

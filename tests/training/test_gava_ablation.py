@@ -88,14 +88,14 @@ def test_an_interrupted_ablation_gives_the_same_table(whole, tmp_path, monkeypat
     batch = gava.GavaTask.batch
     taken = []
 
-    def until_fourth(task, number):
+    def until_fourth(task, number, *shares):
         if task.config.decoder == "sa" and number == 3:
             raise KeyboardInterrupt
-        return batch(task, number)
+        return batch(task, number, *shares)
 
-    def recorded(task, number):
+    def recorded(task, number, *shares):
         taken.append((task.config.decoder, number))
-        return batch(task, number)
+        return batch(task, number, *shares)
 
     monkeypatch.setattr(gava.GavaTask, "batch", until_fourth)
     with pytest.raises(KeyboardInterrupt):

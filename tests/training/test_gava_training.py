@@ -22,7 +22,7 @@ def corpus(tmp_path_factory):
 
 def options(corpus, output, **changes):
     defaults = {
-        "data": corpus,
+        "data": (corpus,),
         "output": output,
         "encoder": "mel",
         "width": 16,
@@ -49,6 +49,13 @@ def test_it_learns_to_speak_from_a_random_start(corpus, tmp_path):
     model = train_gava(options(corpus, tmp_path / "plain"), progress=False)
     found = errors(corpus, [model])
     assert found["train", "LG+GAVA (plain)"] < 0.5 * found["train", "template held still"]
+    card = (model / "README.md").read_text()
+    (row,) = (line for line in card.splitlines() if "mean vertex error" in line)
+    ours, still = (float(cell) for cell in row.split("|")[-3:-1])
+    assert ours == pytest.approx(found["test", "LG+GAVA (plain)"], abs=2e-3)
+    assert still == pytest.approx(found["test", "template held still"], abs=2e-3)
+    assert "--encoder mel" in card
+    assert "--cpu" in card
     loaded = Gava.from_pretrained(model)
     assert loaded.config.subjects == ("anna", "ben")
     assert loaded.config.emotions == ("neutral", "joy")
