@@ -1,6 +1,9 @@
 """Talking-head data sets."""
 
+from meshanim.datasets.biwi import BiwiDataset, BiwiOptions
+from meshanim.datasets.conversion import convert
 from meshanim.datasets.faceformer import FaceFormerDataset, FaceFormerOptions
+from meshanim.datasets.mesh_folder import MeshFolderDataset, MeshFolderOptions
 from meshanim.datasets.meshanim_format import MeshanimDataset
 from meshanim.datasets.motion_dataset import (
     DatasetOptions,
@@ -10,15 +13,23 @@ from meshanim.datasets.motion_dataset import (
     Subject,
     open_dataset,
 )
+from meshanim.datasets.vocaset import VocasetDataset, VocasetOptions
 
 __all__ = [
+    "BiwiDataset",
+    "BiwiOptions",
     "DatasetOptions",
     "FaceFormerDataset",
     "FaceFormerOptions",
+    "MeshFolderDataset",
+    "MeshFolderOptions",
     "MeshanimDataset",
     "MotionDataset",
     "MotionSequence",
     "SequenceInfo",
     "Subject",
+    "VocasetDataset",
+    "VocasetOptions",
+    "convert",
     "open_dataset",
 ]

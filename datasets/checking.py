@@ -1,19 +1,20 @@
 """What can be wrong with a data set, found by reading all of it."""
 
 import hashlib
-import sys
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from tqdm import tqdm
 
 from meshanim.audio import Waveform
-from meshanim.datasets.motion_dataset import MotionArrays, MotionDataset, SequenceInfo
+from meshanim.datasets.motion_dataset import DatasetSource, MotionArrays, MotionDataset, SequenceInfo
 from meshanim.errors import MeshanimError
+from meshanim.jobs import run_jobs
 
-__all__ = ["SequenceReport", "check_dataset", "check_sequence"]
+__all__ = ["SequenceReport", "check_dataset", "check_sequence", "opened"]
 
 TOLERANCE = 2.0
 """Frames by which sound and motion may differ in length; published data differ by one."""
@@ -31,7 +32,7 @@ class SequenceReport:
     name : str
         Of the sequence.
     defects : tuple of str
-        One line each.
+        One line each, without the name.
     motion, audio : str
         Digests of the arrays and of the samples; empty where they cannot be read.
     """
@@ -60,7 +61,7 @@ def check_sequence(dataset: MotionDataset, name: str) -> SequenceReport:
         defects += _audio_defects(waveform, info)
     except MeshanimError as error:
         defects.append(str(error))
-    return SequenceReport(name, tuple(dict.fromkeys(f"{name}: {line}" for line in defects)), motion, audio)
+    return SequenceReport(name, tuple(dict.fromkeys(defects)), motion, audio)
 
 
 def _digest_of_motion(arrays: MotionArrays) -> str:
@@ -110,15 +111,52 @@ def _audio_defects(waveform: Waveform, info: SequenceInfo | None) -> Iterator[st
         )
 
 
-def check_dataset(dataset: MotionDataset, progress: bool = False) -> list[str]:
-    """Every defect of a data set as one line "where: what"."""
-    bar = tqdm(dataset.sequences, unit="sequence", desc="check", disable=not progress, file=sys.stderr)
-    reports = [check_sequence(dataset, name) for name in bar]
-    lines = [line for report in reports for line in report.defects]
+@lru_cache(maxsize=1)
+def opened(source: DatasetSource) -> MotionDataset:
+    """The data set in this process, opened once."""
+    return source.open()
+
+
+def _check_job(job: tuple[DatasetSource, str]) -> SequenceReport:
+    source, name = job
+    return check_sequence(opened(source), name)
+
+
+def check_dataset(dataset: MotionDataset, progress: bool = False, workers: int = 1) -> list[str]:
+    """Every defect of a data set as one line "where: what".
+
+    Parameters
+    ----------
+    dataset : MotionDataset
+        What to read.
+    progress : bool
+        Show a bar.
+    workers : int
+        Local processes; 0 takes one a core, 1 this process.
+    """
+    if workers == 1:
+        found = (check_sequence(dataset, name) for name in dataset.sequences)
+    else:
+        found = run_jobs(_check_job, [(dataset.source, name) for name in dataset.sequences], workers)
+    bar = tqdm(found, "check", len(dataset), unit="sequence", disable=not progress)
+    reports = sorted(bar, key=lambda report: report.name)
+    lines = _merged(reports)
     lines += _twice(reports)
     lines += _subject_defects(dataset)
     lines += _split_defects(dataset)
     return lines
+
+
+def _merged(reports: list[SequenceReport]) -> list[str]:
+    """A line a defect; what is wrong with one file that many sequences share is said once."""
+    names = defaultdict(list)
+    for report in reports:
+        for defect in report.defects:
+            names[defect].append(report.name)
+    return [
+        f"{where[0]}{f' and {len(where) - 1} more' if len(where) > 1 else ''}: {defect}"
+        for defect, where in names.items()
+    ]
 
 
 def _twice(reports: list[SequenceReport]) -> Iterator[str]:

@@ -7,7 +7,8 @@
 import importlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -20,7 +21,9 @@ from meshanim.geometry import TriangleMesh
 
 __all__ = [
     "LOADERS",
+    "UNITS",
     "DatasetOptions",
+    "DatasetSource",
     "MotionArrays",
     "MotionDataset",
     "MotionSequence",
@@ -36,11 +39,18 @@ __all__ = [
 LOADERS = {
     "meshanim": "meshanim_format:MeshanimDataset",
     "faceformer": "faceformer:FaceFormerDataset",
+    "vocaset": "vocaset:VocasetDataset",
+    "biwi": "biwi:BiwiDataset",
     "multiface": "multiface:MultifaceDataset",
     "mead": "mead:MeadDataset",
     "unitalker": "unitalker:UniTalkerDataset",
     "diffposetalk": "diffposetalk:DiffPoseTalkDataset",
+    "meshes": "mesh_folder:MeshFolderDataset",
 }
+
+
+UNITS = ("m", "biwi")
+"""Metres, or units of the square root of the face's area in each frame (BIWI as FaceFormer reads it)."""
 
 
 @dataclass(frozen=True)
@@ -183,6 +193,29 @@ class DatasetOptions:
             raise OptionError(f"stride is {self.stride}; expected at least 1")
 
 
+@dataclass(frozen=True)
+class DatasetSource:
+    """Where a data set is and how to read it: what a job takes to another process or machine.
+
+    Parameters
+    ----------
+    directory : Path
+        Absolute.
+    kind : str
+        A key of `LOADERS`.
+    options : DatasetOptions
+        The loader's.
+    """
+
+    directory: Path
+    kind: str
+    options: DatasetOptions
+
+    def open(self) -> "MotionDataset":
+        """The data set."""
+        return open_dataset(self.directory, self.kind, self.options)
+
+
 class MotionDataset(ABC):
     """Subjects, splits and sequences of one folder; opening reads small files and headers alone.
 
@@ -309,22 +342,62 @@ class MotionDataset(ABC):
         ------
         OptionError
             If there is no such split; the message lists those there are.
+        FileFormatError
+            If a sequence of it is missing.
         """
         if name not in self.splits:
             raise OptionError(
                 f"{self.directory} has no split {name!r}; there are {', '.join(self.splits) or 'none'}"
             )
+        missing = [member for member in self.splits[name] if member not in self._names]
+        if missing:
+            raise FileFormatError(
+                f"{self.directory} lacks {len(missing)} sequences of split {name}, such as {missing[0]}"
+            )
         return self.splits[name]
 
+    @cached_property
+    def _names(self) -> frozenset[str]:
+        return frozenset(self.sequences)
+
+    def _strided(self, info: SequenceInfo) -> SequenceInfo:
+        """What is known of the file, as it is with every `stride`-th frame."""
+        return replace(info, fps=self.fps, frames=-(-info.frames // self.options.stride))
+
+    def _every(self, frames: int, arrays: MotionArrays) -> MotionArrays:
+        """Every `stride`-th frame of arrays of the file; coefficients of other lengths are of no frame."""
+        step = self.options.stride
+        if step == 1:
+            return arrays
+        return MotionArrays(
+            arrays.vertices[::step],
+            None if arrays.pose is None else arrays.pose[::step],
+            None if arrays.curves is None else arrays.curves[::step],
+            every_frame(arrays.coefficients, frames, step),
+        )
+
     def _known(self, name: str) -> None:
-        if name not in self.sequences:
+        if name not in self._names:
             raise OptionError(f"{self.directory} has no sequence {name!r}; there are {len(self.sequences)}")
 
-    def check(self, progress: bool = False) -> list[str]:
+    @property
+    def source(self) -> DatasetSource:
+        """How to open it again elsewhere."""
+        return DatasetSource(self.directory.resolve(), self.kind, self.options)
+
+    def check(self, progress: bool = False, workers: int = 1) -> list[str]:
         """Read everything; every defect as one line "where: what", empty if all is well."""
         from meshanim.datasets.checking import check_dataset
 
-        return check_dataset(self, progress=progress)
+        return check_dataset(self, progress, workers)
+
+
+def every_frame(arrays: Mapping[str, np.ndarray], frames: int, stride: int) -> dict[str, np.ndarray]:
+    """Every `stride`-th frame of arrays with as many rows as frames; others are of no frame and stay."""
+    return {
+        key: array[::stride] if array.ndim and len(array) == frames else array
+        for key, array in arrays.items()
+    }
 
 
 def loader(kind: str) -> type[MotionDataset]:

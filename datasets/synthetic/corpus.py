@@ -334,8 +334,6 @@ def _make(options: SynthesizeOptions, take: Take) -> str:
 
 
 def _done(options: SynthesizeOptions, take: Take) -> bool:
-    if options.format == "faceformer":
-        return (options.directory / "vertices_npy" / f"{_name(take)}.npy").exists()
     return (options.directory / "sequences" / _name(take) / "sequence.json").exists()
 
 

@@ -10,7 +10,10 @@ import soxr
 from meshanim.errors import FileFormatError, OptionError, ShapeError
 from meshanim.files import written_whole
 
-__all__ = ["Waveform", "load_waveform", "save_waveform"]
+__all__ = ["FULL_SCALE", "Waveform", "load_waveform", "save_waveform"]
+
+FULL_SCALE = 32768
+"""Steps of a 16-bit sample to amplitude 1."""
 
 CONTAINERS = (".m4a", ".mp4")
 
@@ -146,8 +149,17 @@ def _decode(path: Path) -> tuple[np.ndarray, int]:
     return samples.T, int(rate)
 
 
-def save_waveform(waveform: Waveform, path: str | Path) -> None:
+def save_waveform(waveform: Waveform, path: str | Path, lossless: bool = False) -> None:
     """Write 16-bit PCM (wav or flac by the ending); amplitudes beyond full scale are clipped.
+
+    Parameters
+    ----------
+    waveform : Waveform
+        What to write. Samples that came from a 16-bit file are written as they were.
+    path : str or Path
+        Ends in .wav or .flac.
+    lossless : bool
+        Write 32-bit floats (wav alone) where 16 bits do not hold the samples exactly.
 
     Raises
     ------
@@ -157,5 +169,10 @@ def save_waveform(waveform: Waveform, path: str | Path) -> None:
     path = Path(path)
     if path.suffix[1:].upper() not in soundfile.available_formats():
         raise FileFormatError(f"{path} ends in {path.suffix or 'nothing'!r}; expected .wav or .flac")
+    steps = np.clip(np.rint(waveform.samples.astype(np.float64) * FULL_SCALE), -FULL_SCALE, FULL_SCALE - 1)
+    exact = not lossless or np.array_equal(steps, waveform.samples.astype(np.float64) * FULL_SCALE)
     with written_whole(path) as temporary:
-        soundfile.write(temporary, np.clip(waveform.samples, -1, 1), waveform.rate, subtype="PCM_16")
+        if exact:
+            soundfile.write(temporary, steps.astype(np.int16), waveform.rate, subtype="PCM_16")
+        else:
+            soundfile.write(temporary, waveform.samples, waveform.rate, subtype="FLOAT")

@@ -19,7 +19,7 @@ VERBS = {
     "demo": "the same on a recorded sentence that ships with the package",
     "train": "train a model: gava",
     "evaluate": "score a model on held-out data: gava",
-    "data": "data sets: synthesize, check, augment-pose, cache-features",
+    "data": "data sets: synthesize, info, check, convert, augment-pose, cache-features",
     "bench": "measurements that anyone can repeat: attention, animate",
     "doctor": "what is installed, which backends work, how to get what is missing",
 }

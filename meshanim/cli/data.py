@@ -1,29 +1,123 @@
-"""`meshanim data`: make and check data sets."""
+"""`meshanim data`: make, describe, check and convert data sets."""
 
+import json
 import sys
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
-from tyro.conf import Positional
+from tyro.conf import OmitArgPrefixes, Positional
 
-from meshanim.datasets import MeshanimDataset
+from meshanim.datasets.conversion import convert
+from meshanim.datasets.motion_dataset import (
+    MotionDataset,
+    detect_kind,
+    loader_options,
+    open_dataset,
+)
 from meshanim.datasets.pose_augmentation import AugmentPoseOptions, augment_pose
 from meshanim.datasets.synthetic.corpus import SynthesizeOptions, synthesize
+from meshanim.errors import FileFormatError, MeshanimError
+from meshanim.files import written_whole
 from meshanim.training.feature_cache import CacheFeaturesOptions, cache_features
 
-__all__ = ["COMMANDS", "CheckOptions"]
+__all__ = ["COMMANDS", "CheckOptions", "ConvertOptions", "InfoOptions", "ReadingOptions"]
+
+
+@dataclass(frozen=True)
+class ReadingOptions:
+    """How to read a data set; what is not given is known or told by the files."""
+
+    kind: str = "auto"
+    """Its layout: meshanim, faceformer, vocaset, biwi, multiface, mead, unitalker, diffposetalk, meshes; auto
+    tells it by the files."""
+    stride: int | None = None
+    """Take every n-th frame."""
+    fps: float | None = None
+    """Frames a second of the files, where they do not say."""
+    scale: float | None = None
+    """Metres for one unit of the files (faceformer, meshes, unitalker)."""
+    faces: Path | None = None
+    """A mesh file with the faces, where the data set has none."""
+    published: str | None = None
+    """Whose splits (faceformer): vocaset, biwi, auto, none."""
+    preprocess: Literal["metres", "codetalker"] | None = None
+    """BIWI's raw files: to metres, or to the unit of CodeTalker's."""
+    head: str | None = None
+    """A head, flame:PATH, that makes vertices of coefficients (mead, unitalker, diffposetalk)."""
+    audio: Path | None = None
+    """Folder of MEAD's sound."""
+    vertices: int | None = None
+    """Multiface: 7306 or 6172."""
+    dropped: Path | None = None
+    """Multiface: list of the vertices that 6172 leaves out."""
+    template: Path | None = None
+    """Multiface: OBJ of 6172 vertices."""
+    full_template: Path | None = None
+    """Multiface: OBJ of 7306 vertices in the pose of the template."""
+
+    def open(self, directory: Path) -> MotionDataset:
+        """The data set in a folder, read so."""
+        kind = detect_kind(directory) if self.kind == "auto" else self.kind
+        given = {key: value for key, value in asdict(self).items() if key != "kind"}
+        return open_dataset(directory, kind, loader_options(kind, given))
+
+
+@dataclass(frozen=True)
+class InfoOptions:
+    """Say what a data set holds, from its headers alone.
+
+    Example: meshanim data info vocaset
+    """
+
+    directory: Positional[Path]
+    """The folder."""
+    reading: OmitArgPrefixes[ReadingOptions] = ReadingOptions()
+    """How to read it."""
+    json: Path | None = None
+    """Write it as JSON too."""
 
 
 @dataclass(frozen=True)
 class CheckOptions:
-    """Read every file of a data set and say what is wrong.
+    """Read every file of a data set and list every defect; exit code 1 if there is one.
 
     Example: meshanim data check corpus
     """
 
     directory: Positional[Path]
-    """Folder with dataset.json."""
+    """The folder."""
+    reading: OmitArgPrefixes[ReadingOptions] = ReadingOptions()
+    """How to read it."""
+    workers: int = 0
+    """Processes; 0 takes one a core."""
+    json: Path | None = None
+    """Write the defects as JSON too."""
+
+
+@dataclass(frozen=True)
+class ConvertOptions:
+    """Write any data set in the project's own layout or in FaceFormer's.
+
+    Example: meshanim data convert vocaset corpus --faces FLAME_sample.ply
+    """
+
+    directory: Positional[Path]
+    """The folder to read."""
+    target: Positional[Path]
+    """The folder to write; an interrupted run is continued."""
+    format: Literal["meshanim", "faceformer"] = "meshanim"
+    """meshanim, or faceformer: wav/, vertices_npy/, templates.pkl, and the rest beside them."""
+    reading: OmitArgPrefixes[ReadingOptions] = ReadingOptions()
+    """How to read it."""
+    skip_defects: bool = False
+    """Leave out sequences that cannot be read instead of stopping."""
+    workers: int = 0
+    """Processes; 0 takes one a core."""
+    dask: str = ""
+    """Address of a Dask scheduler, such as tcp://host:8786, whose workers convert instead."""
 
 
 def _synthesize(options: SynthesizeOptions) -> int:
@@ -32,17 +126,91 @@ def _synthesize(options: SynthesizeOptions) -> int:
     return 0
 
 
+def _description(dataset: MotionDataset) -> dict[str, Any]:
+    seconds, unreadable = 0.0, 0
+    for name in dataset.sequences:
+        try:
+            seconds += dataset.info(name).frames / dataset.fps
+        except MeshanimError:
+            unreadable += 1
+    sizes = {len(subject.template) for subject in dataset.subjects.values()}
+    return {
+        "name": dataset.name,
+        "kind": dataset.kind,
+        "subjects": list(dataset.subjects),
+        "sequences": len(dataset),
+        "unreadable": unreadable,
+        "seconds": round(seconds, 3),
+        "fps": dataset.fps,
+        "unit": dataset.unit,
+        "vertices": sorted(sizes),
+        "faces": dataset.mesh.n_faces if dataset.mesh else 0,
+        "head": dataset.head,
+        "curves": len(dataset.curve_names),
+        "splits": {split: len(names) for split, names in dataset.splits.items()},
+    }
+
+
+def _print_description(about: Mapping[str, Any]) -> None:
+    splits = ", ".join(f"{count} {split}" for split, count in about["splits"].items()) or "no splits"
+    unit = {"m": "metres", "biwi": "BIWI's unit (square root of the face's area)"}[about["unit"]]
+    size = ", ".join(map(str, about["vertices"]))
+    print(f"{about['name']} ({about['kind']} layout)")
+    print(f"{len(about['subjects'])} subjects, {about['sequences']} sequences ({splits})")
+    print(f"{about['seconds'] / 60:.1f} min at {about['fps']:g} fps")
+    print(f"{size} vertices in {unit}, {about['faces'] or 'no'} faces, {about['curves']} curves")
+    if about["unreadable"]:
+        print(f"{about['unreadable']} sequences cannot be read: meshanim data check says why")
+
+
+def _write_json(path: Path | None, record: Mapping[str, Any]) -> None:
+    if path is not None:
+        with written_whole(path) as temporary:
+            temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+
+
+def _info(options: InfoOptions) -> int:
+    about = _description(options.reading.open(options.directory))
+    _print_description(about)
+    _write_json(options.json, about)
+    return 0
+
+
 def _check(options: CheckOptions) -> int:
-    dataset = MeshanimDataset(options.directory)
-    faults = dataset.check()
-    for fault in faults:
-        print(fault, file=sys.stderr)
-    seconds = sum(dataset.info(name).frames for name in dataset.sequences) / dataset.fps
-    splits = ", ".join(f"{len(names)} {split}" for split, names in dataset.splits.items())
-    print(f"{dataset.name}: {len(dataset.subjects)} subjects, {len(dataset)} sequences ({splits})")
-    print(f"{seconds / 60:.1f} min at {dataset.fps:g} fps, {dataset.mesh.n_vertices} vertices")
-    print(f"{len(faults)} faults")
-    return 2 if faults else 0
+    if options.reading.kind == "auto":
+        detect_kind(options.directory)
+    try:
+        dataset = options.reading.open(options.directory)
+    except FileFormatError as error:  # damaged where opening reads it: that is the defect
+        defects: list[str] = [str(error)]
+        about = None
+    else:
+        defects = dataset.check(sys.stderr.isatty(), options.workers)
+        about = _description(dataset)
+    for defect in defects:
+        print(defect, file=sys.stderr)
+    if about is not None:
+        _print_description(about)
+    print(f"{len(defects)} defects")
+    _write_json(options.json, {"defects": defects, "dataset": about})
+    return 1 if defects else 0
+
+
+def _convert(options: ConvertOptions) -> int:
+    dataset = options.reading.open(options.directory)
+    done = convert(
+        dataset,
+        options.target,
+        options.format,
+        options.workers,
+        options.dask,
+        options.skip_defects,
+        progress=sys.stderr.isatty(),
+    )
+    for name, reason in done.skipped.items():
+        print(f"left out {name}: {reason}", file=sys.stderr)
+    print(f"wrote {options.target}: {done.sequences} sequences, {done.kept} of them by an earlier run")
+    return 0
 
 
 def _augment_pose(options: AugmentPoseOptions) -> int:
@@ -61,7 +229,9 @@ def _cache_features(options: CacheFeaturesOptions) -> None:
 
 COMMANDS = {
     "synthesize": _synthesize,
+    "info": _info,
     "check": _check,
+    "convert": _convert,
     "augment-pose": _augment_pose,
     "cache-features": _cache_features,
 }

@@ -275,7 +275,7 @@ def test_contradictions_are_named(damaged):
     assert "not finite" in MeshanimDataset(damaged).check()[0]
     shutil.rmtree(path.parent)
     with pytest.raises(FileFormatError, match="lacks 1 sequences of split train"):
-        MeshanimDataset(damaged)
+        MeshanimDataset(damaged).split("train")
 
 
 def test_other_versions_are_refused(damaged):
