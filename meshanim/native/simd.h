@@ -36,6 +36,7 @@ inline Floats fma(Floats a, Floats b, Floats c) { return _mm512_fmadd_ps(a, b, c
 inline Floats maximum(Floats a, Floats b) { return _mm512_max_ps(a, b); }  // b on NaN
 inline Floats minimum(Floats a, Floats b) { return _mm512_min_ps(a, b); }  // b on NaN
 inline Floats round(Floats a) { return _mm512_roundscale_ps(a, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC); }
+inline Floats square_root(Floats a) { return _mm512_sqrt_ps(a); }
 // a times two to the power n, n whole and within +-300.
 inline Floats scale_by_power(Floats a, Floats n) { return _mm512_scalef_ps(a, n); }
 
@@ -80,6 +81,7 @@ inline void store_first(float *p, Floats a, int n) { _mm256_maskstore_ps(p, firs
 inline Floats fma(Floats a, Floats b, Floats c) { return _mm256_fmadd_ps(a, b, c); }
 inline Floats maximum(Floats a, Floats b) { return _mm256_max_ps(a, b); }
 inline Floats minimum(Floats a, Floats b) { return _mm256_min_ps(a, b); }
+inline Floats square_root(Floats a) { return _mm256_sqrt_ps(a); }
 inline Floats round(Floats a) { return _mm256_round_ps(a, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC); }
 // In two halves, so that denormal results come out right.
 inline Floats scale_by_power(Floats a, Floats n) {
@@ -137,6 +139,7 @@ inline Floats maximum(Floats a, Floats b) {
 inline Floats minimum(Floats a, Floats b) {
     return each([&](int i) { return a.lane[i] < b.lane[i] ? a.lane[i] : b.lane[i]; });
 }
+inline Floats square_root(Floats a) { return each([&](int i) { return std::sqrt(a.lane[i]); }); }
 inline Floats round(Floats a) { return each([&](int i) { return std::nearbyint(a.lane[i]); }); }
 inline float power_of_two(int n) {
     const uint32_t bits = uint32_t(n + 127) << 23;

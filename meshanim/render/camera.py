@@ -153,11 +153,11 @@ def orthographic_camera(
     margin: int = 4,
 ) -> Camera:
     """A parallel projection of all `vertices` seen from `direction`, at `pixel` metres a pixel."""
-    vertices, direction = np.asarray(vertices, np.float64), np.asarray(direction, np.float64)
+    direction = np.asarray(direction, np.float64)
     up = (0.0, 1.0, 0.0) if abs(direction[1]) < 0.99 * np.linalg.norm(direction) else (0.0, 0.0, 1.0)
     matrix = look_at(direction, np.zeros(3), up)
-    turned = vertices @ matrix[:3, :3].T
-    low, high = turned.min(0), turned.max(0)
+    turned = matrix[:3, :3].astype(np.float32) @ np.asarray(vertices, np.float32).T
+    low, high = turned.min(1).astype(float), turned.max(1).astype(float)
     matrix[:3, 3] = -low + np.array([margin, margin, margin]) * pixel
     size = np.ceil((high - low)[:2] / pixel).astype(int) + 2 * margin
     scale = np.diag([1 / pixel, 1 / pixel, 1.0])

@@ -12,15 +12,15 @@ struct Fragments {
     std::unique_ptr<float[]> floats;
     std::unique_ptr<int[]> ints;
     int *pixel, *face, *part;
-    float *coverage, *depth, *u, *v, *occlusion, *roughness, *specular, *cornea, *lit, *lining, *scatter, *open;
+    float *coverage, *depth, *u, *v, *occlusion, *roughness, *specular, *cornea, *lit, *lining, *scatter, *open, *cosine, *sine;
     float *position[3], *normal[3], *view[3], *bumped[3], *diffuse[3], *albedo[3], *irradiance[3], *reflection[3], *wrap[3];
 
     explicit Fragments(int capacity) {
-        float **single[] = {&coverage, &depth, &u, &v, &occlusion, &roughness, &specular, &cornea, &lit, &lining, &scatter, &open};
+        float **single[] = {&coverage, &depth, &u, &v, &occlusion, &roughness, &specular, &cornea, &lit, &lining, &scatter, &open, &cosine, &sine};
         float **triple[] = {position, normal, view, bumped, diffuse, albedo, irradiance, reflection, wrap};
-        // Not a multiple of a page, or all fields of a fragment would fall into the same cache set.
+        // Room for a whole vector at the end. Not a multiple of a page, or all fields of a fragment would fall into the same cache set.
         const int64_t padded = (capacity + 1023) / 1024 * 1024 + 48;
-        floats.reset(new float[padded * (12 + 3 * 9)]);
+        floats.reset(new float[padded * (14 + 3 * 9)]());
         ints.reset(new int[padded * 3]);
         float *next = floats.get();
         for (float **field : single) *field = next, next += padded;

@@ -6,6 +6,7 @@
 
 #include "fragments.h"
 #include "raster.h"
+#include "simd.h"
 #include "vector.h"
 
 namespace MESHANIM_NAMESPACE {
@@ -99,9 +100,12 @@ struct Taps {                                // a disc of samples on Vogel's spi
     }
 };
 
-struct Turn {
-    float cosine, sine;
-    explicit Turn(float angle) : cosine(std::cos(angle)), sine(std::sin(angle)) {}
+struct Circle {                              // points of the unit circle, to turn the taps by
+    static constexpr int N = 1024;
+    float cosine[N], sine[N];
+    Circle() {
+        for (int k = 0; k < N; ++k) cosine[k] = std::cos(2 * PI * k / N), sine[k] = std::sin(2 * PI * k / N);
+    }
 };
 
 struct Lamp {                                // the shadow map's camera: pixels and depth of a point
@@ -308,110 +312,140 @@ void material(const Mesh &mesh, const Part &part, const Quality &quality, Fragme
     }
 }
 
-// Screen-space occlusion within 6 mm, for contact that the resting sky visibility does not know.
-float screen_occlusion(const Eye &eye, const Quality &q, const Taps &taps, Turn turn, int width, int height,
-                       const float *depth, const Fragments &r, int i, int y) {
+// Screen-space occlusion within 6 mm, for contact that the resting sky visibility does not know: (n,) in `open_share`.
+void screen_occlusion(const Eye &eye, const Quality &q, const Taps &taps, int width, int height, const float *depth,
+                      const Fragments &r, int n, int y, float *occlusion, float *weight, float *open_share) {
+    constexpr float INVERSE = 1 / (0.006f * 0.006f);
     const int s = q.samples, columns = width * s, rows = height * s;
     const float reach = std::max(0.004f * q.pixels_per_metre, 1.0f) * s, least = 0.75f * s;
-    const float px = (r.pixel[i] + 0.5f) * s, py = (y + 0.5f) * s, back = 1.0f / s;
-    const Vec p = r.get(r.position, i), n = r.get(r.normal, i);
-    float occlusion = 0, weight = 0;
+    const float py = (y + 0.5f) * s, back = 1.0f / s, inverse_fx = 1 / eye.fx, inverse_fy = 1 / eye.fy;
+    const float *cosine = r.cosine, *sine = r.sine;
+    const float *x0 = r.position[0], *y0 = r.position[1], *z0 = r.position[2], *nx = r.normal[0], *ny = r.normal[1], *nz = r.normal[2];
+    const Vec right = eye.world_to_row[0], down = eye.world_to_row[1], ahead = eye.world_to_row[2];
+    for (int i = 0; i < n; ++i) occlusion[i] = weight[i] = 0;
     for (int k = 0; k < taps.n; ++k) {
-        const float ux = taps.x[k] * turn.cosine - taps.y[k] * turn.sine, uy = taps.x[k] * turn.sine + taps.y[k] * turn.cosine;
-        const float stretch = reach + least / ((k + 0.5f) / taps.n);
-        const int x = int(px + stretch * ux), v = int(py + stretch * uy);
-        if (x < 0 || v < 0 || x >= columns || v >= rows) continue;
-        ++weight;
-        const float z = depth[int64_t(v) * columns + x];
-        if (!(z < 1e30f)) continue;
-        const Vec d = eye.position + eye.ray((x + 0.5f) * back, (v + 0.5f) * back) * z - p;
-        const float square = dot(d, d) + 1e-18f, fall = 1 - square * (1 / (0.006f * 0.006f));
-        if (fall <= 0) continue;
-        const float c = dot(d, n) / std::sqrt(square);
-        if (c > 0.12f) occlusion += (c - 0.12f) * fall;
-    }
-    return std::max(0.0f, 1 - 2.1f * occlusion / std::max(weight, 1.0f));
-}
-
-// Share of a disc in the shadow map that is not nearer to the light.
-float shadow(const Lamp &lamp, const Quality &q, const Taps &taps, Turn turn, Vec p, Vec n) {
-    constexpr float BIAS = 0.0012f;
-    const Vec a = p + n * BIAS;
-    const float x = dot(lamp.x, a) + lamp.at[0], y = dot(lamp.y, a) + lamp.at[1], z = dot(lamp.z, a) + lamp.at[2] - BIAS;
-    const float c = q.shadow_radius * lamp.scale * turn.cosine, s = q.shadow_radius * lamp.scale * turn.sine;
-    int lit = 0;
-    for (int k = 0; k < taps.n; ++k) {
-        const int i = int(std::floor(x + taps.x[k] * c - taps.y[k] * s)), j = int(std::floor(y + taps.x[k] * s + taps.y[k] * c));
-        lit += i < 0 || j < 0 || i >= lamp.width || j >= lamp.height || lamp.map[int64_t(j) * lamp.width + i] > z;
-    }
-    return float(lit) / taps.n;
-}
-
-// GGX distribution over Smith's geometry term (Karis 2013, k = (roughness + 1)^2 / 8).
-inline float lobe(float roughness, float nh, float nl, float nv) {
-    const float square = roughness * roughness, a2 = square * square, t = nh * nh * (a2 - 1) + 1;
-    const float k = (roughness + 1) * (roughness + 1) * 0.125f;
-    return a2 / (PI * t * t * (nl * (1 - k) + k) * (nv * (1 - k) + k));
-}
-
-// Wrapped diffuse and two GGX lobes of every light, over all fragments of the row.
-void lights(const Lighting &lighting, const Part *parts, const Quality &q, Fragments &r, int n) {
-#pragma omp simd
-    for (int i = 0; i < n; ++i) {
-        const float up = r.diffuse[1][i] * 0.5f + 0.5f, ao = r.occlusion[i], root = std::sqrt(ao);
-        const float red = root * (0.45f + 0.55f * root);
-        r.irradiance[0][i] = (lighting.ground[0] + (lighting.sky[0] - lighting.ground[0]) * up) * red;
-        r.irradiance[1][i] = (lighting.ground[1] + (lighting.sky[1] - lighting.ground[1]) * up) * ao;
-        r.irradiance[2][i] = (lighting.ground[2] + (lighting.sky[2] - lighting.ground[2]) * up) * ao;
-        r.reflection[0][i] = r.reflection[1][i] = r.reflection[2][i] = 0;
-    }
-    const float first_share = q.lobes > 1 ? 0.7f : 1.0f, second_share = 1 - first_share;
-    for (int j = 0; j < lighting.n; ++j) {
-        const float lx = lighting.direction[j][0], ly = lighting.direction[j][1], lz = lighting.direction[j][2];
-        const float red = lighting.color[j][0], green = lighting.color[j][1], blue = lighting.color[j][2];
-        const float shadowed = j == lighting.shadowed ? 1.0f : 0.0f;
-        const float *occlusion = r.occlusion, *in_light = r.lit, *open = r.open, *roughness = r.roughness, *specular = r.specular;
-        const float *dx = r.diffuse[0], *dy = r.diffuse[1], *dz = r.diffuse[2];
-        const float *bx = r.bumped[0], *by = r.bumped[1], *bz = r.bumped[2];
-        const float *ex = r.view[0], *ey = r.view[1], *ez = r.view[2];
-        const float *w0 = r.wrap[0], *w1 = r.wrap[1], *w2 = r.wrap[2];
-        float *e0 = r.irradiance[0], *e1 = r.irradiance[1], *e2 = r.irradiance[2];
-        float *s0 = r.reflection[0], *s1 = r.reflection[1], *s2 = r.reflection[2];
+        const float stretch = reach + least / ((k + 0.5f) / taps.n), tx = taps.x[k] * stretch, ty = taps.y[k] * stretch;
 #pragma omp simd
         for (int i = 0; i < n; ++i) {
-            const float ao = occlusion[i], lit = open[i] + shadowed * (in_light[i] - open[i]);
-            const float nd = dx[i] * lx + dy[i] * ly + dz[i] * lz;
-            const float amount = lit * std::min(1.0f, 0.4f + 0.6f * ao) * (1.35f / PI);
-            e0[i] += red * amount * std::max((nd + w0[i]) / (1 + w0[i]), 0.0f);
-            e1[i] += green * amount * std::max((nd + w1[i]) / (1 + w1[i]), 0.0f);
-            e2[i] += blue * amount * std::max((nd + w2[i]) / (1 + w2[i]), 0.0f);
-            const float nx = bx[i], ny = by[i], nz = bz[i], vx = ex[i], vy = ey[i], vz = ez[i];
-            const float nl = std::max(0.0f, nx * lx + ny * ly + nz * lz);
-            const float nv = std::max(0.05f, nx * vx + ny * vy + nz * vz);
-            const float hx = lx + vx, hy = ly + vy, hz = lz + vz;
-            const float inverse = 1 / std::sqrt(hx * hx + hy * hy + hz * hz + 1e-12f);
-            const float nh = std::min(1.0f, std::max(0.0f, (nx * hx + ny * hy + nz * hz) * inverse));
-            const float g = 1 - std::max(0.0f, (vx * hx + vy * hy + vz * hz) * inverse), g2 = g * g;
-            const float fresnel = SPECULAR_NORMAL + (1 - SPECULAR_NORMAL) * g2 * g2 * g;
-            const float lobes = first_share * lobe(roughness[i], nh, nl, nv) +
-                                second_share * lobe(std::max(0.08f, roughness[i] * 0.62f), nh, nl, nv);
-            const float shine = specular[i] * lit * ao * lobes * 0.25f * fresnel * nl;
-            s0[i] += shine * red, s1[i] += shine * green, s2[i] += shine * blue;
+            const int x = int((r.pixel[i] + 0.5f) * s + tx * cosine[i] - ty * sine[i]), v = int(py + tx * sine[i] + ty * cosine[i]);
+            const bool inside = (x >= 0) & (v >= 0) & (x < columns) & (v < rows);
+            const float z = std::min(depth[inside ? v * columns + x : 0], 1e6f);
+            const float b = ((v + 0.5f) * back - eye.cy) * inverse_fy, a = ((x + 0.5f) * back - eye.cx - eye.skew * b) * inverse_fx;
+            const float dx = eye.position.x + (right.x * a + down.x * b + ahead.x) * z - x0[i];
+            const float dy = eye.position.y + (right.y * a + down.y * b + ahead.y) * z - y0[i];
+            const float dz = eye.position.z + (right.z * a + down.z * b + ahead.z) * z - z0[i];
+            const float square = dx * dx + dy * dy + dz * dz + 1e-18f, fall = std::max(0.0f, 1 - square * INVERSE);
+            const float c = std::max(0.0f, (dx * nx[i] + dy * ny[i] + dz * nz[i]) / std::sqrt(square) - 0.12f);
+            occlusion[i] += inside ? c * fall : 0.0f;
+            weight[i] += inside ? 1.0f : 0.0f;
         }
     }
-    // Reflection of the sky: a horizon gradient; eyes see one soft box instead.
+#pragma omp simd
+    for (int i = 0; i < n; ++i) open_share[i] = std::max(0.0f, 1 - 2.1f * occlusion[i] / std::max(weight[i], 1.0f));
+}
+
+// Share of a disc in the shadow map that is not nearer to the light, of each fragment.
+void shadow(const Lamp &lamp, const Quality &q, const Taps &taps, Fragments &r, int n, float *x, float *y, float *z) {
+    constexpr float BIAS = 0.0012f;
+    const float radius = q.shadow_radius * lamp.scale, share = 1.0f / taps.n;
+    const float *cosine = r.cosine, *sine = r.sine;
+    const float *x0 = r.position[0], *y0 = r.position[1], *z0 = r.position[2], *nx = r.normal[0], *ny = r.normal[1], *nz = r.normal[2];
+    const float *map = lamp.map;
+    const int width = lamp.width, height = lamp.height;
+    float *lit = r.lit;
+#pragma omp simd
     for (int i = 0; i < n; ++i) {
-        const Vec b = r.get(r.bumped, i), v = r.get(r.view, i);
-        const float nv = dot(b, v), edge = 1 - clamp(nv, 0.0f, 1.0f), ao = r.occlusion[i];
-        const Vec mirror = b * (2 * nv) - v;
-        const float rough = 1 - r.roughness[i], s = clamp(mirror.y * 0.5f + 0.5f, 0.0f, 1.0f);
-        const float fresnel = SPECULAR_NORMAL + 0.5f * rough * rough * edge * edge * edge * edge * edge;
-        const float amount = (0.10f + 0.55f * s * s) * fresnel * r.specular[i] * ao * (0.35f + 0.3f * rough);
-        r.reflection[0][i] += 0.9f * amount, r.reflection[1][i] += amount, r.reflection[2][i] += 1.1f * amount;
+        const float px = x0[i] + nx[i] * BIAS, py = y0[i] + ny[i] * BIAS, pz = z0[i] + nz[i] * BIAS;
+        x[i] = lamp.x.x * px + lamp.x.y * py + lamp.x.z * pz + lamp.at[0];
+        y[i] = lamp.y.x * px + lamp.y.y * py + lamp.y.z * pz + lamp.at[1];
+        z[i] = lamp.z.x * px + lamp.z.y * py + lamp.z.z * pz + lamp.at[2] - BIAS;
+        lit[i] = 0;
+    }
+    for (int k = 0; k < taps.n; ++k) {
+        const float tx = taps.x[k] * radius, ty = taps.y[k] * radius;
+#pragma omp simd
+        for (int i = 0; i < n; ++i) {
+            const float u = x[i] + tx * cosine[i] - ty * sine[i], v = y[i] + tx * sine[i] + ty * cosine[i];
+            const bool inside = (u >= 0) & (v >= 0) & (u < width) & (v < height);
+            const float seen = map[inside ? int(v) * width + int(u) : 0];
+            lit[i] += inside & (seen <= z[i]) ? 0.0f : share;
+        }
+    }
+}
+
+// One lobe of GGX over Smith's geometry term (Karis 2013, k = (roughness + 1)^2 / 8): what no light changes, then a light.
+struct Lobe {
+    simd::Floats scale, width, k, rest;
+    Lobe(simd::Floats roughness, simd::Floats nv, float share) {
+        using simd::broadcast;
+        const simd::Floats square = roughness * roughness, a2 = square * square, wide = roughness + broadcast(1.0f);
+        k = wide * wide * broadcast(0.125f), rest = broadcast(1.0f) - k, width = a2 - broadcast(1.0f);
+        scale = a2 * broadcast(share / PI) / (nv * rest + k);
+    }
+    simd::Floats of(simd::Floats square_nh, simd::Floats nl) const {
+        const simd::Floats t = square_nh * width + simd::broadcast(1.0f);
+        return scale / (t * t * (nl * rest + k));
+    }
+};
+
+// Wrapped diffuse and one or two GGX lobes of every light and the sky's reflection, over all fragments of the row.
+template <int LOBES> void lights(const Lighting &lighting, const Part *parts, Fragments &r, int n) {
+    using simd::broadcast, simd::Floats, simd::maximum, simd::minimum;
+    const Floats one = broadcast(1.0f), zero = simd::zeros(), half = broadcast(0.5f);
+    for (int i = 0; i < n; i += simd::LANES) {
+        const auto at = [&](const float *field) { return simd::load(field + i); };
+        const Floats ao = at(r.occlusion), open = at(r.open), roughness = at(r.roughness), specular = at(r.specular);
+        const Floats dx = at(r.diffuse[0]), dy = at(r.diffuse[1]), dz = at(r.diffuse[2]);
+        const Floats bx = at(r.bumped[0]), by = at(r.bumped[1]), bz = at(r.bumped[2]);
+        const Floats vx = at(r.view[0]), vy = at(r.view[1]), vz = at(r.view[2]);
+        const Floats facing = bx * vx + by * vy + bz * vz, nv = maximum(facing, broadcast(0.05f));
+        const Lobe first(roughness, nv, LOBES > 1 ? 0.7f : 1.0f);
+        const Lobe second(maximum(broadcast(0.08f), roughness * broadcast(0.62f)), nv, 0.3f);
+        Floats wrap[3], softer[3], diffuse[3], shine[3] = {zero, zero, zero};
+        const Floats up = dy * half + half, root = simd::square_root(ao);
+        const Floats share[3] = {root * (broadcast(0.45f) + broadcast(0.55f) * root), ao, ao};
+        for (int k = 0; k < 3; ++k) {
+            wrap[k] = at(r.wrap[k]), softer[k] = one / (one + wrap[k]);
+            diffuse[k] = (broadcast(lighting.ground[k]) + broadcast(lighting.sky[k] - lighting.ground[k]) * up) * share[k];
+        }
+        const Floats reach = minimum(one, broadcast(0.4f) + broadcast(0.6f) * ao) * broadcast(1.35f / PI);
+        const Floats gloss = specular * ao * broadcast(0.25f);
+        for (int j = 0; j < lighting.n; ++j) {
+            const Floats lx = broadcast(lighting.direction[j][0]), ly = broadcast(lighting.direction[j][1]), lz = broadcast(lighting.direction[j][2]);
+            const Floats lit = j == lighting.shadowed ? at(r.lit) : open;
+            const Floats nd = dx * lx + dy * ly + dz * lz, bl = bx * lx + by * ly + bz * lz, vl = vx * lx + vy * ly + vz * lz;
+            // The half vector of unit vectors v and l has the length sqrt(2 + 2 v . l).
+            const Floats inverse = one / simd::square_root(maximum(broadcast(2.0f) + (vl + vl), broadcast(1e-6f)));
+            const Floats nl = maximum(bl, zero), nh = minimum(one, maximum((bl + facing) * inverse, zero));
+            const Floats g = one - maximum((one + vl) * inverse, zero), g2 = g * g;
+            const Floats fresnel = broadcast(SPECULAR_NORMAL) + broadcast(1 - SPECULAR_NORMAL) * g2 * g2 * g;
+            Floats lobes = first.of(nh * nh, nl);
+            if (LOBES > 1) lobes += second.of(nh * nh, nl);
+            const Floats strength = gloss * lit * lobes * fresnel * nl, amount = lit * reach;
+            for (int k = 0; k < 3; ++k) {
+                const Floats color = broadcast(lighting.color[j][k]);
+                diffuse[k] += color * amount * maximum((nd + wrap[k]) * softer[k], zero);
+                shine[k] += color * strength;
+            }
+        }
+        // Reflection of the sky: a horizon gradient.
+        const Floats edge = one - minimum(one, maximum(facing, zero)), rough = one - roughness, edge2 = edge * edge;
+        const Floats mirror = by * (facing + facing) - vy, s = minimum(one, maximum(mirror * half + half, zero));
+        const Floats fresnel = broadcast(SPECULAR_NORMAL) + half * rough * rough * edge2 * edge2 * edge;
+        const Floats amount = (broadcast(0.10f) + broadcast(0.55f) * s * s) * fresnel * specular * ao * (broadcast(0.35f) + broadcast(0.3f) * rough);
+        const float tint[3] = {0.9f, 1.0f, 1.1f};
+        for (int k = 0; k < 3; ++k) {
+            simd::store(r.irradiance[k] + i, diffuse[k]);
+            simd::store(r.reflection[k] + i, shine[k] + broadcast(tint[k]) * amount);
+        }
+    }
+    // Eyes see one soft box instead.
+    const Vec box = load(lighting.catch_light), side = unit(cross(box, Vec{0, 1, 0})), top = cross(side, box);
+    for (int i = 0; i < n; ++i) {
         if (parts[r.part[i]].kind != EYE) continue;
-        const Vec box = load(lighting.catch_light), side = unit(cross(box, Vec{0, 1, 0})), top = cross(side, box);
+        const Vec b = r.get(r.bumped, i), v = r.get(r.view, i), mirror = b * (2 * dot(b, v)) - v;
         const float inside = dot(mirror, box) > 0 ? smoothstep(0.20f, 0.16f, std::abs(dot(mirror, side))) * smoothstep(0.26f, 0.22f, std::abs(dot(mirror, top))) : 0.0f;
-        const float glint = 1.15f * inside * r.cornea[i] * clamp(ao * 1.3f - 0.2f, 0.0f, 1.0f);
+        const float glint = 1.15f * inside * r.cornea[i] * clamp(r.occlusion[i] * 1.3f - 0.2f, 0.0f, 1.0f);
         for (int k = 0; k < 3; ++k) r.reflection[k][i] = r.reflection[k][i] * 0.25f + glint;
     }
 }
@@ -428,6 +462,7 @@ void shade(const Mesh &mesh, const Part *parts, const View &view, const Lighting
     const Eye eye(view);
     const Lamp lamp(light, map);
     const Taps shadow_taps(quality.shadow_taps, true), occlusion_taps(quality.occlusion_taps, false);
+    static const Circle circle;
 #pragma omp parallel num_threads(threads)
     {
         Fragments r(width * quality.samples * quality.samples);
@@ -442,12 +477,20 @@ void shade(const Mesh &mesh, const Part *parts, const View &view, const Lighting
                 material(mesh, part, quality, r, i);
                 const float wrap[3] = {part.kind == SKIN ? 0.20f : 0.05f, part.kind == SKIN ? 0.08f : 0.05f, 0.05f};
                 for (int k = 0; k < 3; ++k) r.wrap[k][i] = wrap[k];
-                const Turn turn(noise(r.pixel[i], y) * 2 * PI);
-                if (quality.occlusion_taps > 0 && part.kind != EYE)
-                    r.occlusion[i] *= 0.5f + 0.5f * screen_occlusion(eye, quality, occlusion_taps, turn, width, height, depth, r, i, y);
-                if (map) r.lit[i] = shadow(lamp, quality, shadow_taps, turn, r.get(r.position, i), r.get(r.normal, i));
+                const int turn = int(noise(r.pixel[i], y) * Circle::N) & (Circle::N - 1);
+                r.cosine[i] = circle.cosine[turn], r.sine[i] = circle.sine[turn];
             }
-            lights(lighting, parts, quality, r, n);
+            // The light's fields are not needed yet: they serve as scratch.
+            if (quality.occlusion_taps > 0) {
+                screen_occlusion(eye, quality, occlusion_taps, width, height, depth, r, n, y, r.reflection[0], r.reflection[1], r.reflection[2]);
+                for (int i = 0; i < n; ++i)
+                    if (parts[r.part[i]].kind != EYE) r.occlusion[i] *= 0.5f + 0.5f * r.reflection[2][i];
+            }
+            if (map) shadow(lamp, quality, shadow_taps, r, n, r.reflection[0], r.reflection[1], r.reflection[2]);
+            if (quality.lobes > 1)
+                lights<2>(lighting, parts, r, n);
+            else
+                lights<1>(lighting, parts, r, n);
             for (int i = 0; i < n; ++i) {
                 const int64_t at = row + r.pixel[i];
                 const float c = r.coverage[i];
