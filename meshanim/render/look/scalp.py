@@ -215,6 +215,9 @@ def scalp_hair(
     if style.curl:
         points = _curl(points, style, draws)
     points = _clear(ground, points, style)
+    if style.over_ears:
+        keep = ~_strays(points, roots, person)
+        texels, points, normals = texels[keep], points[keep], normals[keep]
     groups = [(texels, points, normals)]
     if person.hair == "bun":
         groups.append(_knot(ground, texels, draws))
@@ -324,6 +327,13 @@ def _clear(ground: Ground, points: np.ndarray, style: _Style) -> np.ndarray:
     normal, height = ground.nearest(flat)
     flat = flat + normal * np.clip(0.5 - height, 0, None)[:, None]
     return np.concatenate([points[:, :1], flat.reshape(len(points), -1, 3)], axis=1)
+
+
+def _strays(points: np.ndarray, roots: Points, person: PersonParameters) -> np.ndarray:
+    """Strands that hang over the forehead and do not belong to a fringe: singly they look like scratches."""
+    x, y, z = np.abs(points[..., 0]), points[..., 1], points[..., 2]
+    below = hairline(points.reshape(-1, 3), 0.0, 0.0).reshape(x.shape) < -5
+    return ((x < 58) & (y > 20) & (z > 20) & below).any(1) & ~_in_fringe(roots, person)
 
 
 def _knot(ground: Ground, texels: np.ndarray, draws: np.random.Generator):

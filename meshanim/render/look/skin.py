@@ -205,7 +205,7 @@ def _distribution(density: np.ndarray) -> np.ndarray:
 def _lips(canvas: _Canvas, albedo: np.ndarray, lines: np.ndarray) -> np.ndarray:
     """Lips over the mouth's lining, which darkens towards the throat."""
     person = canvas.person
-    tint = np.array([0.82, 0.52, 0.50]) * canvas.fair + np.array([0.94, 0.70, 0.72]) * person.tone
+    tint = np.array([0.85, 0.58, 0.56]) * canvas.fair + np.array([0.94, 0.70, 0.72]) * person.tone
     natural = canvas.base * (1 - (1 - tint) * (1 - 0.35 * person.masculinity))
     color = natural * (1 - person.lip_amount) + srgb_to_linear(person.lip_color) * person.lip_amount
     upper = smoothstep(-42, -38, canvas.y)
