@@ -24,6 +24,8 @@ TEETH_DARKENING = (1.05, 0.040, 0.14, 1.2)
 """How light falls off behind the lips: start, length in metres, floor, power."""
 
 DETAIL_TILES = 22
+WIDEST_STRAND = 0.00125
+"""Metres, of a strand that stands for its neighbours."""
 
 
 class HeadScene:
@@ -270,7 +272,8 @@ def _native_strands(appearance: Appearance, step: int) -> dict[str, list]:
             name: getattr(strands, name)[::every]
             for name in ("triangle", "barycentric", "offsets", "normals", "occlusion", "width", "color")
         }
-        arrays["width"] = arrays["width"] * every**0.8
+        if every > 1:  # wider ones cost more than they cover
+            arrays["width"] = np.minimum(arrays["width"] * every**0.8, WIDEST_STRAND)
         if not len(arrays["width"]):
             continue
         native = _native.Strands(
