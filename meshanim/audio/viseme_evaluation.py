@@ -1,7 +1,4 @@
-"""How often the phonemes and visemes of recorded speech are found.
-
-python -m meshanim.audio.viseme_evaluation CLIPS
-"""
+"""How often the phonemes and visemes of recorded speech are found: `meshanim evaluate visemes`."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -20,7 +17,15 @@ from meshanim.audio.waveform import Waveform, load_waveform
 from meshanim.errors import FileFormatError, OptionError
 from meshanim.results import Results
 
-__all__ = ["Clip", "degraded", "evaluate", "load_clips", "scores"]
+__all__ = [
+    "Clip",
+    "EvaluateVisemesOptions",
+    "degraded",
+    "evaluate",
+    "evaluate_visemes",
+    "load_clips",
+    "scores",
+]
 
 RATE = 50.0
 """Frames a second that are judged."""
@@ -204,30 +209,22 @@ def evaluate(
 
 
 @dataclass(frozen=True)
-class Evaluation:
+class EvaluateVisemesOptions:
     """Judge speech encoders with phoneme or viseme outputs on recorded clips.
 
-    Example: python -m meshanim.audio.viseme_evaluation clips/ --encoders visemes phones visemes+phones
-
-    Parameters
-    ----------
-    clips : Path
-        Folder of sound files, each with NAME.txt, what it says.
-    encoders : tuple of str
-        visemes, visemes:utterance (statistics of the whole clip), phones, visemes+phones.
-    weights : Path, optional
-        Another viseme net than the packaged one.
-    conditions : tuple of str
-        clean, noise20, noise10, telephone, room, quiet.
-    json : Path, optional
-        Where the numbers go.
+    Example: meshanim evaluate visemes clips/ --encoders visemes phones visemes+phones
     """
 
     clips: tyro.conf.Positional[Path]
-    encoders: tuple[str, ...] = ("visemes",)
+    """Folder of sound files, each with NAME.txt, what it says."""
+    encoders: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAMES")] = ("visemes",)
+    """visemes, visemes:utterance (statistics of the whole clip), phones, visemes+phones."""
     weights: Path | None = None
+    """Another viseme net than the packaged one."""
     conditions: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAMES")] = ("clean",)
+    """clean, noise20, noise10, telephone, room, quiet."""
     json: Path | None = None
+    """Where the numbers go."""
 
 
 def _posteriors(name: str, weights: Path | None) -> Posteriors:
@@ -252,14 +249,20 @@ def _posteriors(name: str, weights: Path | None) -> Posteriors:
     return run
 
 
-def main() -> None:
-    job = tyro.cli(Evaluation)
-    clips = load_clips(job.clips)
+def evaluate_visemes(options: EvaluateVisemesOptions, progress: bool = True) -> Results:
+    """Scores of each encoder under each condition, by group of clips where clean, and its speed.
+
+    Raises
+    ------
+    FileFormatError, OptionError
+        If a clip cannot be read, or an encoder or condition does not exist.
+    """
+    clips = load_clips(options.clips)
     seconds = sum(clip.waveform.duration for clip in clips)
-    results = Results("visemes")
-    for name in tqdm(job.encoders, desc="encoders", disable=len(job.encoders) < 2):
-        posteriors = _posteriors(name, job.weights)
-        for condition in job.conditions:
+    results = Results("evaluate visemes")
+    for name in tqdm(options.encoders, desc="encoders", disable=not progress):
+        posteriors = _posteriors(name, options.weights)
+        for condition in options.conditions:
             start = time.perf_counter()
             found, groups = evaluate(clips, posteriors, condition)
             speed = seconds / (time.perf_counter() - start)
@@ -269,11 +272,6 @@ def main() -> None:
             if condition == "clean":
                 for group, value in groups.items():
                     results.add(f"clean, {group}", name, "viseme_accuracy", value, "ratio")
-    print(f"{len(clips)} clips, {seconds:.1f} s")
-    print(results.table())
-    if job.json is not None:
-        results.save(job.json)
-
-
-if __name__ == "__main__":
-    main()
+    if options.json is not None:
+        results.save(options.json)
+    return results

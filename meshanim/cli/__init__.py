@@ -18,7 +18,7 @@ VERBS = {
     "animate": "speech in; a video, glTF, npz or contact sheet of a talking head out",
     "demo": "the same on a recorded sentence that ships with the package",
     "train": "train a model: gava",
-    "evaluate": "score a model on held-out data: gava",
+    "evaluate": "score models and motion on held-out data, compare scores: gava, motion, compare, ...",
     "data": "data sets: synthesize, info, check, convert, augment-pose, cache-features",
     "bench": "measurements that anyone can repeat: attention, animate",
     "doctor": "what is installed, which backends work, how to get what is missing",

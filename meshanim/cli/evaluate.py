@@ -1,8 +1,11 @@
-"""`meshanim evaluate`: score a model on held-out data, beside baselines."""
+"""`meshanim evaluate`: score models and motion, and compare scores."""
 
 import sys
 
+from meshanim.audio.viseme_evaluation import EvaluateVisemesOptions, evaluate_visemes
+from meshanim.comparison import CompareOptions, compare, comparison_results, comparison_table
 from meshanim.results import Results
+from meshanim.training.folder_evaluation import EvaluateMotionOptions, evaluate_motion
 from meshanim.training.gava_ablation import AblationOptions, ablation_table, gava_ablation
 from meshanim.training.gava_evaluation import EvaluateGavaOptions, evaluate_gava
 from meshanim.training.gava_maps import GavaMapsOptions, draw_gava_maps
@@ -27,4 +30,29 @@ def _gava_maps(options: GavaMapsOptions) -> None:
     print(f"wrote {options.output}")
 
 
-COMMANDS = {"gava": _gava, "gava-ablation": _gava_ablation, "gava-maps": _gava_maps}
+def _motion(options: EvaluateMotionOptions) -> None:
+    results, notes = evaluate_motion(options, progress=sys.stderr.isatty())
+    print(results.metrics_table())
+    for note in notes:
+        print(note)
+
+
+def _compare(options: CompareOptions) -> None:
+    differences = compare(options)
+    print(comparison_table(differences, options.level))
+    if options.json is not None:
+        comparison_results(differences).save(options.json)
+
+
+def _visemes(options: EvaluateVisemesOptions) -> None:
+    print(evaluate_visemes(options, progress=sys.stderr.isatty()).table())
+
+
+COMMANDS = {
+    "gava": _gava,
+    "gava-ablation": _gava_ablation,
+    "gava-maps": _gava_maps,
+    "motion": _motion,
+    "visemes": _visemes,
+    "compare": _compare,
+}

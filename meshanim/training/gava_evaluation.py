@@ -81,7 +81,7 @@ def evaluate_gava(options: EvaluateGavaOptions, progress: bool = True) -> Result
     results = Results("evaluate gava")
     for split in options.splits:
         for name, predict in methods.items():
-            evaluation = MotionEvaluation(masks, dataset.fps, jitter_above=options.jitter_above)
+            evaluation = MotionEvaluation(masks, dataset.fps, dataset.unit, options.jitter_above)
             names = dataset.split(split)
             for value in measure(dataset, names, predict, evaluation, f"{split}: {name}", progress):
                 results.add_measured(split, name, value)
