@@ -18,7 +18,7 @@ Features = Float[Tensor, "frames dim"]
 class Moments(NamedTuple):
     """Sums from which mean and covariance follow; those of two sets of frames add up."""
 
-    count: Float[Tensor, ""]
+    frames: Float[Tensor, ""]
     total: Float[Tensor, " dim"]
     outer: Float[Tensor, "dim dim"]
 
@@ -57,7 +57,7 @@ def motion_features(
 
 
 def moments(features: Features) -> Moments:
-    """Count, sum and sum of outer products, in float64."""
+    """Number, sum and sum of outer products, in float64."""
     check_finite(features)
     values = features.double()
     return Moments(values.new_tensor(len(values)), values.sum(0), values.T @ values)
@@ -73,7 +73,7 @@ def frechet_of_moments(first: Moments, second: Moments) -> Float[Tensor, ""]:
     """
     if first.total.shape != second.total.shape:
         raise ShapeError(f"{len(first.total)} and {len(second.total)} features cannot be compared")
-    if min(float(first.count), float(second.count)) < 2:
+    if min(float(first.frames), float(second.frames)) < 2:
         raise ShapeError("a Gaussian needs at least two frames on either side")
     (mean_a, root_a), (mean_b, root_b) = (_mean_and_root(m) for m in (first, second))
     # tr (A B)^(1/2) is the sum of the singular values of A^(1/2) B^(1/2).
@@ -102,7 +102,7 @@ def frechet_distance(predicted: Features, true: Float[Tensor, "true_frames dim"]
 
 
 def _mean_and_root(sums: Moments) -> tuple[Float[Tensor, " dim"], Float[Tensor, "dim dim"]]:
-    mean = sums.total / sums.count
-    covariance = (sums.outer - torch.outer(mean, mean) * sums.count) / (sums.count - 1)
+    mean = sums.total / sums.frames
+    covariance = (sums.outer - torch.outer(mean, mean) * sums.frames) / (sums.frames - 1)
     values, vectors = torch.linalg.eigh(covariance)
     return mean, (vectors * values.clamp_min(0).sqrt()) @ vectors.T
