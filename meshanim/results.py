@@ -79,7 +79,10 @@ def _mask(value: MetricValue) -> str:
 
 @dataclass(frozen=True)
 class Row:
-    """One number: what was measured (`case`), of what (`implementation`), which quantity, and its unit."""
+    """One number: what was measured (`case`), of what (`implementation`), which quantity, and its unit.
+
+    `measured` says how, for the metrics of an evaluation; timings and the like have none.
+    """
 
     case: str
     implementation: str
@@ -87,7 +90,6 @@ class Row:
     value: float
     unit: str
     measured: MetricValue | None = None
-    """How a metric was measured; None for timings and the like."""
 
     def record(self) -> dict[str, object]:
         """As JSON has it: what is known about a metric beside the five fields of every row."""

@@ -64,6 +64,8 @@ def evaluate_gava(options: EvaluateGavaOptions, progress: bool = True) -> Result
         If the data set or a checkpoint cannot be read, or they do not fit together.
     """
     dataset = MeshanimDataset(options.data)
+    if not any(dataset.split(split) for split in options.splits):
+        raise OptionError(f"{options.data} has no sequences in {', '.join(options.splits)}")
     models = {}
     for name in (options.model, *map(str, options.compare)):
         model = topology_of(load_gava(name), dataset)

@@ -178,6 +178,7 @@ def test_pose_error_is_the_angle_between():
 
 
 @given(st.lists(angles, min_size=9, max_size=9))
+@settings(max_examples=25, deadline=None)
 def test_pose_error_does_not_see_a_common_turn(values):
     one, other, turn = torch.tensor(values, dtype=torch.float64).reshape(3, 1, 3)
     turned = [
@@ -222,7 +223,7 @@ def test_features_see_jitter_but_no_face():
 
 
 @given(st.integers(0, 99), st.lists(angles, min_size=3, max_size=3), st.lists(angles, min_size=3, max_size=3))
-@settings(max_examples=25)
+@settings(max_examples=25, deadline=None)
 def test_vertex_errors_do_not_see_a_common_rigid_motion(seed, turn, shift):
     predicted, true = moving(seed), moving(seed + 1000)
     rotation = roma.rotvec_to_rotmat(torch.tensor(turn, dtype=torch.float64))
@@ -245,7 +246,7 @@ def test_vertex_errors_do_not_see_a_common_rigid_motion(seed, turn, shift):
 
 
 @given(st.integers(0, 99), st.floats(0.01, 100))
-@settings(max_examples=25)
+@settings(max_examples=25, deadline=None)
 def test_metrics_scale_with_their_unit(seed, scale):
     predicted, true = moving(seed), moving(seed + 1000)
     template = true[0]
@@ -267,7 +268,7 @@ def test_metrics_scale_with_their_unit(seed, scale):
 
 
 @given(st.integers(0, 99), st.permutations(range(4)), st.permutations(range(12)))
-@settings(max_examples=25)
+@settings(max_examples=25, deadline=None)
 def test_order_of_vertices_and_frames(seed, vertices, frames):
     predicted, true = moving(seed), moving(seed + 1000)
     everything = torch.arange(4)
@@ -287,6 +288,7 @@ def test_order_of_vertices_and_frames(seed, vertices, frames):
 
 
 @given(st.floats(-0.1, 0.1), st.floats(-0.1, 0.1))
+@settings(max_examples=25, deadline=None)
 def test_an_offset_changes_no_dynamics_along_axes(x, y):
     true = moving(0)
     offset = torch.tensor([x, y, 0], dtype=torch.float64)
