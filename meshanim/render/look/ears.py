@@ -38,10 +38,10 @@ def clear_ears(
     """
     points = strand_points(strands, vertices, faces).astype(float)
     hulls = [(side, ConvexHull(vertices[(ears > 0.3) & (side * vertices[:, 0] > 0)])) for side in (1.0, -1.0)]
-    spread = _follow(sum(side * _exit_distance(points, hull, side) for side, hull in hulls))
+    spread = _follow(np.sum([side * _exit_distance(points, hull, side) for side, hull in hulls], axis=0))
     # A point between the head and the ear may have followed its neighbours into the hull.
     points[..., 0] += spread
-    spread += sum(side * _exit_distance(points, hull, side) for side, hull in hulls)
+    spread += np.sum([side * _exit_distance(points, hull, side) for side, hull in hulls], axis=0)
     spread[:, 0] = 0
     corners = faces[strands.triangle]
     frames = triangle_frames(vertices, corners)
