@@ -134,6 +134,7 @@ def check_dataset(dataset: MotionDataset, progress: bool = False, workers: int =
     workers : int
         Local processes; 0 takes one a core, 1 this process.
     """
+    found: Iterator[SequenceReport]
     if workers == 1:
         found = (check_sequence(dataset, name) for name in dataset.sequences)
     else:

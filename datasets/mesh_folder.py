@@ -84,7 +84,8 @@ class MeshFolderDataset(MotionDataset):
     @classmethod
     def detect(cls, directory: Path) -> bool:
         """By an array with its wav, or a folder with meshes."""
-        return bool(_sources(directory))
+        sources = _sources(directory)
+        return any(path.is_dir() or path.with_suffix(".wav").exists() for path in sources.values())
 
     def __init__(self, directory: str | Path, options: MeshFolderOptions | None = None):
         super().__init__(directory, options)

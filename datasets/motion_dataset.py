@@ -381,6 +381,19 @@ class MotionDataset(ABC):
             raise OptionError(f"{self.directory} has no sequence {name!r}; there are {len(self.sequences)}")
 
     @property
+    def surface(self) -> TriangleMesh:
+        """The mesh, for those who cannot do without one.
+
+        Raises
+        ------
+        FileFormatError
+            If the data set has no faces.
+        """
+        if self.mesh is None:
+            raise FileFormatError(f"{self.directory} has no faces: convert it with --faces MESH")
+        return self.mesh
+
+    @property
     def source(self) -> DatasetSource:
         """How to open it again elsewhere."""
         return DatasetSource(self.directory.resolve(), self.kind, self.options)

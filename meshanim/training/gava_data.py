@@ -117,8 +117,8 @@ def _add(
     """Join the surface with the same faces, or begin another."""
     posed = any(bool(np.any(clip.pose)) for clip in clips)
     for k, known in enumerate(surfaces):
-        if known.mesh.n_vertices == dataset.mesh.n_vertices and np.array_equal(
-            known.mesh.faces, dataset.mesh.faces
+        if known.mesh.n_vertices == dataset.surface.n_vertices and np.array_equal(
+            known.mesh.faces, dataset.surface.faces
         ):
             rows = len(known.templates)
             moved = [replace(clip, subject=clip.subject + rows) for clip in clips]
@@ -135,7 +135,7 @@ def _add(
     surfaces.append(
         TrainingSurface(
             Topology(folder, dataset.head, dataset.fps),
-            dataset.mesh,
+            dataset.surface,
             clips,
             templates,
             torch.from_numpy(lips),

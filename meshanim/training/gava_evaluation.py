@@ -130,11 +130,11 @@ def topology_of(model: Gava, dataset: MeshanimDataset) -> Gava:
     """
     views = [model.on(k) for k in range(model.n_topologies)]
     for view in views:
-        if view.n_vertices == dataset.mesh.n_vertices:
+        if view.n_vertices == dataset.surface.n_vertices:
             return view
     counts = " or ".join(str(view.n_vertices) for view in views)
     raise OptionError(
-        f"the checkpoint animates {counts} vertices, {dataset.directory} has {dataset.mesh.n_vertices}"
+        f"the checkpoint animates {counts} vertices, {dataset.directory} has {dataset.surface.n_vertices}"
     )
 
 
@@ -146,7 +146,7 @@ def describe(name: str, model: Gava) -> str:
 
 def mean_displacement(dataset: MeshanimDataset) -> Float32[np.ndarray, "vertices 3"]:
     """Mean displacement from the template over all training frames."""
-    total, frames = np.zeros((dataset.mesh.n_vertices, 3)), 0
+    total, frames = np.zeros((dataset.surface.n_vertices, 3)), 0
     for name in dataset.split("train"):
         sequence = dataset[name]
         moved = np.asarray(sequence.vertices) - dataset.subjects[sequence.info.subject].template

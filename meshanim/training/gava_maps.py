@@ -192,11 +192,11 @@ def _drawn(
     for i, (symbol, frame) in enumerate(zip(options.phonemes, moments)):
         vertices = heads[i].numpy()
         label = f"{describe(name, model)}\n{symbol}, {(frame + 0.5) / info.fps:.2f} s"
-        tiles = [_labelled(render_mesh(vertices, dataset.mesh, camera), label)]
+        tiles = [_labelled(render_mesh(vertices, dataset.surface, camera), label)]
         for title, values in columns.items():
             low, high = np.percentile(values.numpy(), [1, 99])
             colors = _colors(values[i].numpy(), low, high)
-            tile = render_mesh(vertices, dataset.mesh, camera, colors)
+            tile = render_mesh(vertices, dataset.surface, camera, colors)
             tiles.append(_labelled(tile, f"{title}\n{low:.2g} to {high:.2g}"))
         rows.append(np.concatenate(tiles, axis=1))
     return np.concatenate(rows)
