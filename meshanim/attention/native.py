@@ -12,6 +12,10 @@ except ImportError:  # the extension is optional; `available` says so and mesh_a
 
 __all__ = ["attention_native", "available"]
 
+# From this many floats on, outputs come from the pool of the extension: malloc hands such blocks back to the
+# kernel, and clearing their pages again at every step costs more than the attention itself.
+POOLED = 1 << 18
+
 
 def available() -> bool:
     """Whether the extension was built."""
@@ -59,7 +63,7 @@ def _forward(
     scale: float,
     keep: bool,
 ) -> tuple[Tensor, Tensor]:
-    out, probabilities = _outputs(query, keys, global_token, keep)
+    out, probabilities = (_empty(shape) for shape in _shapes(query, keys, global_token, keep))
     _native.attention_forward(
         query.detach(),
         key.detach(),
@@ -79,17 +83,21 @@ def _forward(
     return out, probabilities
 
 
-def _outputs(query: Tensor, keys: Tensor, global_token: bool, keep: bool) -> tuple[Tensor, Tensor]:
+def _shapes(query: Tensor, keys: Tensor, global_token: bool, keep: bool) -> tuple[torch.Size, torch.Size]:
     batch, tokens, heads, _ = query.shape
     width = 1 << max(heads - 1, 0).bit_length()
     edges = keys.shape[0] + (tokens if global_token else 0)
-    shape = (batch, edges, width) if keep else (0, 0, 0)
-    return query.new_empty(query.shape), query.new_empty(shape)
+    return query.shape, torch.Size((batch, edges, width) if keep else (0, 0, 0))
+
+
+def _empty(shape: torch.Size) -> Tensor:
+    return _native.empty(shape) if shape.numel() >= POOLED else torch.empty(shape, dtype=torch.float32)
 
 
 @_forward.register_fake
 def _(query, key, value, order, offsets, keys, r_offsets, r_edges, r_queries, global_token, scale, keep):
-    return _outputs(query, keys, global_token, keep)
+    out, probabilities = _shapes(query, keys, global_token, keep)
+    return query.new_empty(out), query.new_empty(probabilities)
 
 
 @torch.library.custom_op("meshanim::mesh_attention_backward", mutates_args=(), device_types="cpu")
@@ -109,7 +117,7 @@ def _backward(
     probabilities: Tensor,
     grad_out: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    grads = (query.new_empty(query.shape), query.new_empty(query.shape), query.new_empty(query.shape))
+    grads = (_empty(query.shape), _empty(query.shape), _empty(query.shape))
     _native.attention_backward(
         query.detach(),
         key.detach(),
@@ -126,7 +134,7 @@ def _backward(
         out.detach(),
         probabilities.detach(),
         grad_out.detach(),
-        torch.empty_like(probabilities),
+        _empty(probabilities.shape),
         *grads,
     )
     return grads

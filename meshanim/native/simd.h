@@ -29,6 +29,7 @@ inline __mmask16 first_lanes(int n) { return __mmask16((1u << n) - 1u); }
 inline Floats broadcast(float x) { return _mm512_set1_ps(x); }
 inline Floats load(const float *p) { return _mm512_loadu_ps(p); }
 inline void store(float *p, Floats a) { _mm512_storeu_ps(p, a); }
+inline void stream(float *p, Floats a) { _mm512_stream_ps(p, a); }
 // The first n lanes, 0 <= n <= LANES; zeros beyond.
 inline Floats load_first(const float *p, int n) { return _mm512_maskz_loadu_ps(first_lanes(n), p); }
 inline void store_first(float *p, Floats a, int n) { _mm512_mask_storeu_ps(p, first_lanes(n), a); }
@@ -76,6 +77,7 @@ inline __m256i first_lanes(int n) {
 inline Floats broadcast(float x) { return _mm256_set1_ps(x); }
 inline Floats load(const float *p) { return _mm256_loadu_ps(p); }
 inline void store(float *p, Floats a) { _mm256_storeu_ps(p, a); }
+inline void stream(float *p, Floats a) { _mm256_stream_ps(p, a); }
 inline Floats load_first(const float *p, int n) { return _mm256_maskload_ps(p, first_lanes(n)); }
 inline void store_first(float *p, Floats a, int n) { _mm256_maskstore_ps(p, first_lanes(n), a); }
 inline Floats fma(Floats a, Floats b, Floats c) { return _mm256_fmadd_ps(a, b, c); }
@@ -130,6 +132,7 @@ inline Floats &operator*=(Floats &a, Floats b) { return a = a * b; }
 inline Floats broadcast(float x) { return each([&](int) { return x; }); }
 inline Floats load(const float *p) { return each([&](int i) { return p[i]; }); }
 inline void store(float *p, Floats a) { std::memcpy(p, a.lane, sizeof a); }
+inline void stream(float *p, Floats a) { store(p, a); }
 inline Floats load_first(const float *p, int n) { return each([&](int i) { return i < n ? p[i] : 0.0f; }); }
 inline void store_first(float *p, Floats a, int n) { std::memcpy(p, a.lane, n * sizeof(float)); }
 inline Floats fma(Floats a, Floats b, Floats c) { return a * b + c; }

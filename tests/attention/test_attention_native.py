@@ -135,6 +135,42 @@ def test_bitwise_the_same_for_any_number_of_threads(instruction_set, threads):
         assert all(torch.equal(a, b) for a, b in zip(results[0], other))
 
 
+def test_large_outputs_from_the_pool_are_right(monkeypatch):
+    n = 33_000  # rows of 4 x 4 x 16 floats: large enough to be written past the caches
+    strip = np.stack([np.arange(n - 1), np.arange(1, n)], 1)
+    graph = MeshGraph.from_edges(strip, n)
+    inputs = random_inputs(graph, 4, 4, 16)
+    pooled = mesh_attention(*inputs, graph, backend="native")
+    results = [pooled, *gradients(pooled, inputs)]
+    monkeypatch.setattr(native_module, "POOLED", 1 << 62)
+    plain = mesh_attention(*inputs, graph, backend="native")
+    for ours, theirs in zip(results, [plain, *gradients(plain, inputs)]):
+        assert torch.equal(ours, theirs)
+    expected = mesh_attention(*(tensor.detach() for tensor in inputs), graph, backend="reference")
+    assert torch.allclose(pooled, expected, atol=1e-5)
+
+
+def test_pool_reuses_and_never_holds_more_than_was_in_use():
+    block = 1 << 20
+    first = _native.empty([block])
+    address = first.data_ptr()
+    kept = first[7:].fill_(3.0)
+    del first
+    other = _native.empty([block]).fill_(5.0)
+    assert other.data_ptr() != address, "a view keeps its buffer"
+    assert (kept == 3).all()
+    del kept
+    assert _native.empty([block]).data_ptr() in (address, other.data_ptr())
+    tensors = [_native.empty([scale * block]) for scale in (1, 2, 3)]
+    del tensors, other
+    for scale in (1, 2, 3, 4, 5):
+        _native.empty([scale * block])
+        used, idle, most = _native.pool_bytes()
+        assert used + idle <= most
+    with pytest.raises(ValueError, match="at least one element"):
+        _native.empty([3, 0])
+
+
 def test_without_gradients_the_same_output():
     graph = MeshGraph.from_faces(sphere(2)[1])
     inputs = random_inputs(graph, 2, 4, 16)

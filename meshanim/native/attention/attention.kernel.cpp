@@ -51,6 +51,14 @@ struct Rows {
     const float *operator[](int64_t token) const { return data + token * stride; }
 };
 
+// Whether rows of the tensor are written past the caches: it is larger than they are, and its rows are whole lines.
+// Otherwise every line of it is read before it is written, and pushes out a line that is wanted.
+bool streams(const AttentionTensor &tensor, int64_t batch, int64_t tokens, int64_t features) {
+    constexpr int64_t LARGE = 1 << 23, LINE = 16;  // floats
+    return batch * tokens * features >= LARGE && reinterpret_cast<uintptr_t>(tensor.data) % (LINE * sizeof(float)) == 0 &&
+           tensor.batch_stride % LINE == 0 && tensor.token_stride % LINE == 0;
+}
+
 // Room for the scores of one row, in floats: a whole number of vectors, so that the last one may spill.
 int64_t room(int64_t edges, int64_t width) { return (edges * width + LANES - 1) / LANES * LANES; }
 
@@ -112,7 +120,7 @@ void dots(Shape<VECTORS, HEADS> shape, const float *row, Other other, int count,
 // out = sum over edges of weight(edge)[head] * other(edge), head by head, and of one more edge where it is given.
 template <int VECTORS, int HEADS, class Weight, class Other>
 void combine(Shape<VECTORS, HEADS> shape, Weight weight, Other other, int count, float *out,
-             const float *more_weight = nullptr, const float *more = nullptr) {
+             bool streaming = false, const float *more_weight = nullptr, const float *more = nullptr) {
     if constexpr (VECTORS == 0 || HEADS == 0) {
         const int dim = shape.dim();
         for (int head = 0; head < shape.heads(); ++head)
@@ -136,8 +144,13 @@ void combine(Shape<VECTORS, HEADS> shape, Weight weight, Other other, int count,
             };
             if (more) add(more_weight, more);
             for (int edge = 0; edge < count; ++edge) add(weight(edge), other(edge));
+            if (streaming) {
 #pragma GCC unroll 8
-            for (int i = 0; i < BLOCK; ++i) store(out + (start + i) * LANES, totals[i]);
+                for (int i = 0; i < BLOCK; ++i) stream(out + (start + i) * LANES, totals[i]);
+            } else {
+#pragma GCC unroll 8
+                for (int i = 0; i < BLOCK; ++i) store(out + (start + i) * LANES, totals[i]);
+            }
         }
     }
 }
@@ -261,6 +274,7 @@ void forward_chunk(Shape shape, const AttentionForward &a, int64_t batch, int64_
                    Partials &partials) {
     const AttentionGraph &graph = a.graph;
     const Rows keys(a.key, batch), values(a.value, batch);
+    const bool streaming = streams(a.out, a.batch, graph.tokens(), shape.heads() * shape.dim());
     const int width = shape.width();
     float *kept = a.probabilities ? a.probabilities + batch * graph.all_edges() * width : nullptr;
     const int64_t first = chunk * CHUNK, last = std::min(first + CHUNK, graph.tokens());
@@ -275,7 +289,7 @@ void forward_chunk(Shape shape, const AttentionForward &a, int64_t batch, int64_
         if (kept) std::memcpy(kept + edge * width, scores, count * width * sizeof(float));
         const auto weight = [&](int i) { return scores + i * width; };
         const auto value = [&](int i) { return values[graph.keys[edge + i]]; };
-        combine(shape, weight, value, count, a.out.row(batch, token));
+        combine(shape, weight, value, count, a.out.row(batch, token), streaming);
     });
     if (!graph.global_token) return;
     float *scores = scratch.scores.data();
@@ -333,6 +347,7 @@ void backward_queries(Shape shape, const AttentionBackward &a, int64_t batch, in
                       Scratch &scratch, Partials &partials) {
     const AttentionGraph &graph = a.graph;
     const Rows keys(a.key, batch), values(a.value, batch);
+    const bool streaming = streams(a.grad_query, a.batch, graph.tokens(), shape.heads() * shape.dim());
     const int width = shape.width();
     const int64_t start = batch * graph.all_edges() * width;
     const float *probabilities = a.probabilities + start;
@@ -350,7 +365,7 @@ void backward_queries(Shape shape, const AttentionBackward &a, int64_t batch, in
         std::memcpy(kept + edge * width, gradients, count * width * sizeof(float));
         const auto weight = [&](int i) { return gradients + i * width; };
         const auto key = [&](int i) { return keys[graph.keys[edge + i]]; };
-        combine(shape, weight, key, count, a.grad_query.row(batch, token));
+        combine(shape, weight, key, count, a.grad_query.row(batch, token), streaming);
     });
     if (!graph.global_token) return;
     float *gradients = scratch.scores.data();
@@ -370,6 +385,9 @@ template <class Shape>
 void backward_keys(Shape shape, const AttentionBackward &a, int64_t batch, int64_t chunk) {
     const AttentionGraph &graph = a.graph;
     const Rows queries(a.query, batch), grad_outs(a.grad_out, batch);
+    const int64_t features = shape.heads() * shape.dim();
+    const bool streaming = streams(a.grad_key, a.batch, graph.tokens(), features) &&
+                           streams(a.grad_value, a.batch, graph.tokens(), features);
     const int width = shape.width();
     const int64_t start = batch * graph.all_edges() * width;
     const float *probabilities = a.probabilities + start, *gradients = a.score_gradients + start;
@@ -383,10 +401,10 @@ void backward_keys(Shape shape, const AttentionBackward &a, int64_t batch, int64
         const int32_t *edges = graph.received_edges + from, *tokens = graph.received_queries + from;
         const int64_t global = (graph.edges + row) * width;
         combine(shape, [&](int i) { return gradients + int64_t(edges[i]) * width; },
-                [&](int i) { return queries[tokens[i]]; }, count, a.grad_key.row(batch, token), gradients + global,
+                [&](int i) { return queries[tokens[i]]; }, count, a.grad_key.row(batch, token), streaming, gradients + global,
                 global_query);
         combine(shape, [&](int i) { return probabilities + int64_t(edges[i]) * width; },
-                [&](int i) { return grad_outs[tokens[i]]; }, count, a.grad_value.row(batch, token),
+                [&](int i) { return grad_outs[tokens[i]]; }, count, a.grad_value.row(batch, token), streaming,
                 probabilities + global, global_grad);
     }
 }
