@@ -197,10 +197,10 @@ def _difference(
     common = [sequence for sequence in base.per_sequence if sequence in measured.per_sequence]
     if not common:
         raise OptionError(f"{case}: {name} and the reference have no sequence in common")
-    pairs = [np.array([values.per_sequence[s] for s in common]) for values in (base, measured)]
+    first, second = (np.array([values.per_sequence[s] for s in common]) for values in (base, measured))
     if len(common) == 1:
-        return Difference(case, name, measured, float(pairs[1][0, 0] - pairs[0][0, 0]), None, 1)
-    difference, interval = paired_bootstrap(*pairs, options.level, options.resamples, options.seed)
+        return Difference(case, name, measured, float(second[0, 0] - first[0, 0]), None, 1)
+    difference, interval = paired_bootstrap(first, second, options.level, options.resamples, options.seed)
     return Difference(case, name, measured, difference, interval, len(common))
 
 

@@ -4,7 +4,7 @@ import json
 import os
 import platform
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 
 from meshanim.errors import FileFormatError, OptionError
@@ -206,12 +206,12 @@ def aligned(table: list[list[str]], left: int) -> str:
 
 
 def _row(entry: dict) -> Row:
-    plain = [entry[name] for name in ("case", "implementation", "metric", "value", "unit")]
+    plain = Row(*(entry[name] for name in ("case", "implementation", "metric", "value", "unit")))
     if "mask" not in entry:
-        return Row(*plain)
+        return plain
     known = {part.name: entry[part.name] for part in fields(MetricValue)}
     known["per_sequence"] = {name: (float(v), float(w)) for name, (v, w) in known["per_sequence"].items()}
-    return Row(*plain, MetricValue(**known))
+    return replace(plain, measured=MetricValue(**known))
 
 
 def machine() -> dict[str, str | int | bool]:
