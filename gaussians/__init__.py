@@ -1,6 +1,7 @@
 """Gaussians on meshes."""
 
+from meshanim.gaussians.binding import Binding, bind
 from meshanim.gaussians.cameras import Cameras
 from meshanim.gaussians.gaussians import Gaussians
 
-__all__ = ["Cameras", "Gaussians"]
+__all__ = ["Binding", "Cameras", "Gaussians", "bind"]

@@ -16,7 +16,7 @@ from meshanim.geometry.deformation import DeformationTransfer
 from meshanim.geometry.mesh import TriangleMesh
 from meshanim.geometry.transfer import barycentric_operator, carry
 
-__all__ = ["SurfaceCorrespondence", "surface_correspondence"]
+__all__ = ["SurfaceCorrespondence", "agreeing_points", "surface_correspondence"]
 
 CANDIDATES = 12
 """Faces nearest in place and direction among which the closest point is sought."""
@@ -112,9 +112,9 @@ def surface_correspondence(
     aligned = source.with_vertices(alignment.apply(torch.from_numpy(source.vertices)).numpy())
     registered = aligned.with_vertices(_register(aligned, target, landmarks))
 
-    corners, weights, _, distance = _agreeing_points(registered, target.vertices, target.vertex_normals)
+    corners, weights, _, distance = agreeing_points(registered, target.vertices, target.vertex_normals)
     centres = target.vertices[target.faces].mean(1)
-    *_, faces, _ = _agreeing_points(registered, centres, target.face_normals)
+    *_, faces, _ = agreeing_points(registered, centres, target.face_normals)
     return SurfaceCorrespondence(
         source,
         target,
@@ -135,7 +135,7 @@ def _initial_alignment(source: TriangleMesh, target: TriangleMesh, landmarks: np
     offset = (target.vertices.min(0) + target.vertices.max(0) - scale * (points.min(0) + points.max(0))) / 2
     # Rotation stays: on closest points alone it drifts by degrees along the round parts of a head.
     for _ in range(20):
-        corners, weights, _, distance = _agreeing_points(
+        corners, weights, _, distance = agreeing_points(
             target, scale * points + offset, source.vertex_normals
         )
         closest = np.einsum("nk,nkd->nd", weights, target.vertices[corners])
@@ -161,7 +161,7 @@ def _register(source: TriangleMesh, target: TriangleMesh, landmarks: np.ndarray)
         smooth = (stiffness * _radius(target)) ** 4 * bending
         for _ in range(ROUNDS):
             current = source.with_vertices(source.vertices + moves)
-            corners, weights, face, distance = _agreeing_points(
+            corners, weights, face, distance = agreeing_points(
                 target, current.vertices, current.vertex_normals
             )
             closest = np.einsum("nk,nkd->nd", weights, target.vertices[corners])
@@ -183,7 +183,7 @@ def _register(source: TriangleMesh, target: TriangleMesh, landmarks: np.ndarray)
     return source.vertices + moves
 
 
-def _agreeing_points(
+def agreeing_points(
     mesh: TriangleMesh, points: np.ndarray, normals: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Corners (n, 3), weights (n, 3), face and distance of the closest point whose normal agrees best."""
