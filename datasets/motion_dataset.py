@@ -18,6 +18,7 @@ from jaxtyping import Float32
 from meshanim.audio import Phoneme, Waveform
 from meshanim.errors import FileFormatError, OptionError
 from meshanim.geometry import TriangleMesh
+from meshanim.motion.face_parts import FaceParts
 
 __all__ = [
     "LOADERS",
@@ -45,6 +46,7 @@ LOADERS = {
     "mead": "mead:MeadDataset",
     "unitalker": "unitalker:UniTalkerDataset",
     "diffposetalk": "diffposetalk:DiffPoseTalkDataset",
+    "audio2face": "audio2face:Audio2FaceDataset",
     "meshes": "mesh_folder:MeshFolderDataset",
 }
 
@@ -240,6 +242,8 @@ class MotionDataset(ABC):
         Topology and mean template; None where the layout has no faces.
     head : str
         What `meshanim.heads.load_head` understands, or "".
+    parts : FaceParts or None
+        Which vertices are what, where the files say it.
     curve_names : tuple of str
         Columns of the curves.
     subjects : mapping of Subject
@@ -261,6 +265,7 @@ class MotionDataset(ABC):
     unit: str = "m"
     mesh: TriangleMesh | None = None
     head: str = ""
+    parts: FaceParts | None = None
     curve_names: tuple[str, ...] = ()
     subjects: Mapping[str, Subject]
     sequences: tuple[str, ...]
@@ -310,6 +315,10 @@ class MotionDataset(ABC):
         FileFormatError
             If it is missing or damaged.
         """
+
+    def language(self, name: str) -> str:
+        """What is spoken in a sequence; "en" unless the files say otherwise."""
+        return "en"
 
     def audio_file(self, name: str) -> Path | None:
         """The wav file with exactly the sound of this sequence; None where it is kept otherwise."""

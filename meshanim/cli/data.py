@@ -3,13 +3,14 @@
 import json
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from tyro.conf import OmitArgPrefixes, Positional
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
+from meshanim.datasets.animation_preparation import StateOptions, prepare_states
 from meshanim.datasets.conversion import convert
 from meshanim.datasets.motion_dataset import (
     MotionDataset,
@@ -31,14 +32,14 @@ class ReadingOptions:
     """How to read a data set; what is not given is known or told by the files."""
 
     kind: str = "auto"
-    """Its layout: meshanim, faceformer, vocaset, biwi, multiface, mead, unitalker, diffposetalk, meshes; auto
-    tells it by the files."""
+    """Its layout: meshanim, faceformer, vocaset, biwi, multiface, mead, unitalker, diffposetalk, audio2face,
+    meshes; auto tells it by the files."""
     stride: int | None = None
     """Take every n-th frame."""
     fps: float | None = None
     """Frames a second of the files, where they do not say."""
     scale: float | None = None
-    """Metres for one unit of the files (faceformer, meshes, unitalker)."""
+    """Metres for one unit of the files (faceformer, meshes, unitalker, audio2face)."""
     faces: Path | None = None
     """A mesh file with the faces, where the data set has none."""
     published: str | None = None
@@ -49,6 +50,8 @@ class ReadingOptions:
     """A head, flame:PATH, that makes vertices of coefficients (mead, unitalker, diffposetalk)."""
     audio: Path | None = None
     """Folder of MEAD's sound."""
+    config: Path | None = None
+    """Audio2Face's config_dataset.py with the list of clips."""
     vertices: int | None = None
     """Multiface: 7306 or 6172."""
     dropped: Path | None = None
@@ -118,6 +121,32 @@ class ConvertOptions:
     """Processes; 0 takes one a core."""
     dask: str = ""
     """Address of a Dask scheduler, such as tcp://host:8786, whose workers convert instead."""
+
+
+@dataclass(frozen=True)
+class StatesOptions:
+    """Make Audio2Face-3D's training data: animation states, phonemes, silence, more voices.
+
+    Example: meshanim data a2f corpus -o corpus-a2f
+    """
+
+    directory: Positional[Path]
+    """The folder to read."""
+    output: Annotated[Path, arg(aliases=["-o"])]
+    """The folder to write; an interrupted run is continued."""
+    reading: OmitArgPrefixes[ReadingOptions] = ReadingOptions()
+    """How to read it."""
+    states: OmitArgPrefixes[StateOptions] = field(default_factory=StateOptions)
+    """Components and augmentation."""
+    topology: str = ""
+    """A head (default, flame:PATH, rig:PATH) whose regions say what is skin, tongue, jaw and eyes; the data
+    set's if not given."""
+    parts: Path | None = None
+    """A JSON file that says it instead: lists of vertices by the names of FaceParts."""
+    workers: int = 0
+    """Processes; 0 takes one a core."""
+    dask: str = ""
+    """Address of a Dask scheduler, such as tcp://host:8786, whose workers do it instead."""
 
 
 def _synthesize(options: SynthesizeOptions) -> int:
@@ -223,6 +252,25 @@ def _augment_pose(options: AugmentPoseOptions) -> int:
     return 0
 
 
+def _states(options: StatesOptions) -> int:
+    made = prepare_states(
+        options.reading.open(options.directory),
+        options.output,
+        options.states,
+        options.topology,
+        options.parts,
+        options.workers,
+        options.dask,
+        progress=sys.stderr.isatty(),
+    )
+    skin, tongue = made.pop("skin"), made.pop("tongue")
+    print(f"wrote {options.output}: {', '.join(f'{count} {kind}' for kind, count in made.items())} clips")
+    print(
+        f"components hold {100 * skin:.2f} % of the skin's and {100 * tongue:.2f} % of the tongue's variance"
+    )
+    return 0
+
+
 def _cache_features(options: CacheFeaturesOptions) -> None:
     print(f"wrote {cache_features(options, progress=sys.stderr.isatty())}")
 
@@ -233,5 +281,6 @@ COMMANDS = {
     "check": _check,
     "convert": _convert,
     "augment-pose": _augment_pose,
+    "a2f": _states,
     "cache-features": _cache_features,
 }
