@@ -10,13 +10,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from meshanim.errors import MeshError, OptionError, ShapeError
+from meshanim.errors import BackendError, MeshError, OptionError, ShapeError
+from meshanim.gaussians.binding_native import BindingLists, available, to_world_native
 from meshanim.gaussians.gaussians import Gaussians
 from meshanim.gaussians.harmonics import COEFFICIENTS, harmonics, rotate_harmonics
 from meshanim.geometry import (
     Subdivision,
     SurfaceCorrespondence,
-    TriangleFrames,
     TriangleMesh,
     triangle_frames,
 )
@@ -25,6 +25,7 @@ from meshanim.geometry.correspondence import agreeing_points
 
 __all__ = ["Binding", "Refinement", "bind"]
 
+BACKENDS = ("auto", "native", "reference")
 Vertices = Float[Tensor, "*#batch vertices 3"]
 
 
@@ -146,7 +147,9 @@ class Binding:
         """On another device."""
         return Binding(self.mesh, self.face.to(device))
 
-    def to_world(self, local: Gaussians, vertices: Vertices, rotate_sh: bool = False) -> Gaussians:
+    def to_world(
+        self, local: Gaussians, vertices: Vertices, rotate_sh: bool = False, backend: str = "auto"
+    ) -> Gaussians:
         """Gaussians where the triangles of a posed mesh take them.
 
         Gradients reach the local Gaussians and the vertices, and are finite on triangles without area too.
@@ -160,31 +163,62 @@ class Binding:
         rotate_sh : bool
             If true, spherical harmonics are the triangle's and turn with it; otherwise they are the world's
             (as in GaussianAvatars), so that shading by direction stays where it is when the head turns.
+        backend : str
+            "native" (C++, CPU, float32), "reference" (torch: any device and type) or "auto": native where it
+            is built and applies.
 
         Returns
         -------
         Gaussians
-            means, quaternions and scales with the batch of the vertices, and sh if it turns; the other
-            fields are the very same tensors.
+            means, quaternions and scales with the batch of vertices and Gaussians, and sh if it turns; the
+            other fields are the very same tensors.
 
         Raises
         ------
         ShapeError
             If vertices or Gaussians are of another number, type or device.
+        OptionError, BackendError
+            An unknown backend; one that is not there.
         """
-        frames = self._frames(local, vertices)
-        turn = roma.rotmat_to_unitquat(frames.rotation).index_select(-2, self.face)
-        scale = frames.scale.index_select(-1, self.face)[..., None]
-        rotation = frames.rotation.index_select(-3, self.face)
-        means = scale * (rotation @ local.means[..., None])[..., 0] + frames.origin.index_select(
-            -2, self.face
-        )
-        own = roma.quat_wxyz_to_xyzw(torch.nn.functional.normalize(local.quaternions, dim=-1))
-        quaternions = roma.quat_xyzw_to_wxyz(roma.quat_product(*torch.broadcast_tensors(turn, own)))
+        self._check(local, vertices)
+        fields = local.means, local.quaternions, local.scales
+        batch = torch.broadcast_shapes(vertices.shape[:-2], *(field.shape[:-2] for field in fields))
+        if _choose(backend, vertices) == "native":
+            count = batch.numel()
+            flat = to_world_native(
+                _rows(vertices, batch).expand(count, -1, -1),
+                _rows(local.means, batch),
+                _rows(local.quaternions, batch),
+                _rows(local.scales, batch),
+                self._lists,
+            )
+            means, quaternions, scales = (field.reshape(*batch, *field.shape[-2:]) for field in flat)
+        else:
+            means, quaternions, scales = (
+                field.expand(*batch, -1, -1) for field in self._reference(*fields, vertices)
+            )
         sh = local.sh
         if rotate_sh and sh is not None:
-            sh = rotate_harmonics(sh, rotation)
-        return Gaussians(means, quaternions, scale * local.scales, local.opacities, local.colors, sh)
+            rotation = triangle_frames(vertices, self.faces).rotation
+            sh = rotate_harmonics(sh, rotation.index_select(-3, self.face))
+        return Gaussians(means, quaternions, scales, local.opacities, local.colors, sh)
+
+    def _reference(
+        self, means: Tensor, quaternions: Tensor, scales: Tensor, vertices: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        frames = triangle_frames(vertices, self.faces)
+        turn = roma.rotmat_to_unitquat(frames.rotation).index_select(-2, self.face)
+        scale = frames.scale.index_select(-1, self.face)[..., None]
+        rotation, origin = (
+            frames.rotation.index_select(-3, self.face),
+            frames.origin.index_select(-2, self.face),
+        )
+        own = roma.quat_wxyz_to_xyzw(torch.nn.functional.normalize(quaternions, dim=-1))
+        return (
+            scale * (rotation @ means[..., None])[..., 0] + origin,
+            roma.quat_xyzw_to_wxyz(roma.quat_product(*torch.broadcast_tensors(turn, own))),
+            scale * scales,
+        )
 
     def to_local(self, world: Gaussians, vertices: Vertices, rotate_sh: bool = False) -> Gaussians:
         """The inverse of `to_world`: what any Gaussians in the world are in the frames of their triangles.
@@ -196,7 +230,8 @@ class Binding:
         MeshError
             If a triangle with Gaussians is a point, so that nothing has a place in its frame.
         """
-        frames = self._frames(world, vertices)
+        self._check(world, vertices)
+        frames = triangle_frames(vertices, self.faces)
         scale = frames.scale.index_select(-1, self.face)[..., None]
         if bool((scale == 0).any()):
             flat = self.face[(scale == 0).reshape(-1, len(self), 1).any(0)[:, 0]]
@@ -438,7 +473,11 @@ class Binding:
         rank[order] = torch.arange(len(self), device=self.face.device) - start[self.face[order]]
         return rank
 
-    def _check(self, gaussians: Gaussians) -> None:
+    @cached_property
+    def _lists(self) -> BindingLists:
+        return BindingLists.of(self.mesh.faces, self.mesh.n_vertices, self.face)
+
+    def _check(self, gaussians: Gaussians, vertices: Tensor | None = None) -> None:
         if len(gaussians) != len(self):
             raise ShapeError(f"{len(gaussians)} Gaussians given, {len(self)} are bound")
         if gaussians.means.device != self.face.device:
@@ -446,9 +485,8 @@ class Binding:
                 f"the Gaussians are on {gaussians.means.device}, the binding on {self.face.device}: "
                 "use binding.to(device)"
             )
-
-    def _frames(self, gaussians: Gaussians, vertices: Tensor) -> TriangleFrames:
-        self._check(gaussians)
+        if vertices is None:
+            return
         if vertices.ndim < 2 or tuple(vertices.shape[-2:]) != (self.mesh.n_vertices, 3):
             raise ShapeError(
                 f"vertices must be (..., {self.mesh.n_vertices}, 3), not {tuple(vertices.shape)}"
@@ -458,7 +496,33 @@ class Binding:
                 f"vertices are {vertices.dtype} on {vertices.device}, the Gaussians "
                 f"{gaussians.means.dtype} on {gaussians.means.device}"
             )
-        return triangle_frames(vertices, self.faces)
+
+
+def _choose(backend: str, vertices: Tensor) -> str:
+    if backend not in BACKENDS:
+        raise OptionError(f"backend {backend!r} is not one of {', '.join(BACKENDS)}")
+    fits = vertices.device.type == "cpu" and vertices.dtype == torch.float32
+    if backend == "auto":
+        return "native" if fits and available() else "reference"
+    if backend == "native" and not available():
+        raise BackendError(
+            "backend 'native' is not built: install meshanim with a C++17 compiler at hand, "
+            "or use backend='reference'"
+        )
+    if backend == "native" and not fits:
+        raise BackendError(
+            f"backend 'native' computes float32 on the CPU, not {vertices.dtype} on {vertices.device}: "
+            "use backend='reference'"
+        )
+    return backend
+
+
+def _rows(field: Tensor, batch: torch.Size) -> Tensor:
+    """One leading dimension: of a single frame if all share the field, of all frames otherwise."""
+    shared = field.shape[:-2].numel() == 1
+    return (field if shared else field.expand(*batch, -1, -1)).reshape(
+        1 if shared else batch.numel(), *field.shape[-2:]
+    )
 
 
 def _last(parent: Tensor, kept: int) -> Tensor:

@@ -117,7 +117,7 @@ class Gaussians:
 
     def to(self, *device_or_dtype: torch.device | torch.dtype | str) -> "Gaussians":
         """On another device or of another type."""
-        return self.map(lambda tensor: tensor.to(*device_or_dtype))
+        return self.map(lambda tensor: tensor.to(*device_or_dtype))  # type: ignore[call-overload]
 
     def detach(self) -> "Gaussians":
         """Without gradients."""

@@ -6,6 +6,7 @@ from pathlib import Path
 from meshanim.animation_benchmark import AnimationBenchmark
 from meshanim.attention.benchmark import BenchmarkOptions
 from meshanim.cli.demo import CLIP
+from meshanim.gaussians.binding_benchmark import BindingBenchmark
 from meshanim.results import Results
 
 __all__ = ["COMMANDS"]
@@ -27,6 +28,12 @@ def _animate(options: AnimationBenchmark) -> None:
     _report(results, options.json)
 
 
+def _binding(options: BindingBenchmark) -> None:
+    from meshanim.gaussians import binding_benchmark
+
+    _report(binding_benchmark.run(options), options.json)
+
+
 def _report(results: Results, path: Path | None) -> None:
     print(results.table())
     print(", ".join(f"{key} {value}" for key, value in results.machine.items()))
@@ -34,4 +41,4 @@ def _report(results: Results, path: Path | None) -> None:
         results.save(path)
 
 
-COMMANDS = {"attention": _attention, "animate": _animate}
+COMMANDS = {"attention": _attention, "animate": _animate, "binding": _binding}

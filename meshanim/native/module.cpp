@@ -29,6 +29,7 @@ static Isa &selected() {
 Isa current_isa() { return selected(); }
 
 void bind_attention(nb::module_ &m);
+void bind_binding(nb::module_ &);
 void bind_memory(nb::module_ &);
 void bind_noise(nb::module_ &);
 void bind_raster(nb::module_ &);
@@ -46,6 +47,7 @@ NB_MODULE(_native, m) {
         throw std::invalid_argument("instruction set '" + name + "' is not available on this processor");
     }, nb::arg("name"), "Run the kernels on another instruction set (for tests); ValueError if the processor lacks it.");
     bind_attention(m);
+    bind_binding(m);
     bind_memory(m);
     bind_noise(m);
     bind_raster(m);
