@@ -20,7 +20,7 @@ VERBS = {
     "train": "train a model: gava",
     "evaluate": "score models and motion on held-out data, compare scores: gava, motion, compare, ...",
     "data": "data sets: synthesize, info, check, convert, augment-pose, cache-features",
-    "bench": "measurements that anyone can repeat: attention, animate, binding",
+    "bench": "measurements that anyone can repeat: attention, animate, binding, image-loss",
     "doctor": "what is installed, which backends work, how to get what is missing",
 }
 # Threads that wait by spinning slow each other down many times where other programs want the cores too.

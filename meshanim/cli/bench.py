@@ -7,6 +7,7 @@ from meshanim.animation_benchmark import AnimationBenchmark
 from meshanim.attention.benchmark import BenchmarkOptions
 from meshanim.cli.demo import CLIP
 from meshanim.gaussians.binding_benchmark import BindingBenchmark
+from meshanim.gaussians.loss_benchmark import LossBenchmark
 from meshanim.results import Results
 
 __all__ = ["COMMANDS"]
@@ -34,6 +35,12 @@ def _binding(options: BindingBenchmark) -> None:
     _report(binding_benchmark.run(options), options.json)
 
 
+def _image_loss(options: LossBenchmark) -> None:
+    from meshanim.gaussians import loss_benchmark
+
+    _report(loss_benchmark.run(options), options.json)
+
+
 def _report(results: Results, path: Path | None) -> None:
     print(results.table())
     print(", ".join(f"{key} {value}" for key, value in results.machine.items()))
@@ -41,4 +48,4 @@ def _report(results: Results, path: Path | None) -> None:
         results.save(path)
 
 
-COMMANDS = {"attention": _attention, "animate": _animate, "binding": _binding}
+COMMANDS = {"attention": _attention, "animate": _animate, "binding": _binding, "image-loss": _image_loss}
