@@ -2,6 +2,7 @@
 
 import sys
 
+from meshanim.training.audio2face_regression import TrainRegressionOptions, train_regression
 from meshanim.training.gava import TrainGavaOptions, train_gava
 
 __all__ = ["COMMANDS"]
@@ -11,4 +12,8 @@ def _gava(options: TrainGavaOptions) -> None:
     print(f"wrote {train_gava(options, progress=sys.stderr.isatty())}")
 
 
-COMMANDS = {"gava": _gava}
+def _regression(options: TrainRegressionOptions) -> None:
+    print(f"wrote {train_regression(options, progress=sys.stderr.isatty())}")
+
+
+COMMANDS = {"gava": _gava, "a2f-regression": _regression}

@@ -41,8 +41,12 @@ class TrainConfig:
         Peak of the schedule.
     warmup : int
         Steps of linear warm-up.
-    schedule : "constant" or "cosine"
-        After the warm-up; cosine ends at zero.
+    schedule : "constant", "cosine" or "steps"
+        After the warm-up; cosine ends at `floor`, steps multiplies by `decay` every `decay_steps` steps.
+    floor : float
+        Factor on the learning rate that the cosine ends at.
+    decay, decay_steps : float, int
+        Of the schedule "steps".
     weight_decay : float
         Decoupled (AdamW); 0 is the paper's Adam.
     gradient_clip : float
@@ -71,7 +75,10 @@ class TrainConfig:
     steps: int = 70_000
     learning_rate: float = 1e-4
     warmup: int = 0
-    schedule: Literal["constant", "cosine"] = "constant"
+    schedule: Literal["constant", "cosine", "steps"] = "constant"
+    floor: float = 0.0
+    decay: float = 1.0
+    decay_steps: int = 1
     weight_decay: float = 0.0
     gradient_clip: float = 0.0
     accumulation: int = 1
@@ -84,13 +91,15 @@ class TrainConfig:
     workers: int = 0
 
     def __post_init__(self):
-        for name in ("steps", "accumulation", "log_every", "save_every", "keep"):
+        for name in ("steps", "accumulation", "log_every", "save_every", "keep", "decay_steps"):
             if getattr(self, name) < 1:
                 raise OptionError(f"{name} must be at least 1, not {getattr(self, name)}")
         if self.workers < 0:
             raise OptionError(f"workers must not be negative, not {self.workers}")
         if not self.learning_rate > 0:
             raise OptionError(f"learning_rate must be positive, not {self.learning_rate}")
+        if not (0 < self.decay <= 1 and 0 <= self.floor <= 1):
+            raise OptionError(f"decay {self.decay} and floor {self.floor} must be in (0, 1] and [0, 1]")
         if not 0 <= self.ema < 1:
             raise OptionError(f"ema must be in [0, 1), not {self.ema}")
 
@@ -119,8 +128,10 @@ def learning_rate_factor(config: TrainConfig, step: int) -> float:
         return (step + 1) / config.warmup
     if config.schedule == "constant":
         return 1.0
+    if config.schedule == "steps":
+        return config.decay ** ((step - config.warmup) // config.decay_steps)
     progress = (step - config.warmup) / max(config.steps - config.warmup, 1)
-    return 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
+    return config.floor + (1 - config.floor) * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
 
 
 def last_checkpoint(directory: str | Path) -> Path | None:
@@ -393,6 +404,8 @@ class Trainer:
         except (OSError, ValueError, SafetensorError) as error:
             raise FileFormatError(f"{found} is not a checkpoint of a training run: {error}") from error
         fixed = asdict(self.config)
+        # Options that are younger than the checkpoint had their defaults.
+        described["config"] = asdict(TrainConfig()) | described["config"]
         for name in ("log_every", "save_every", "keep", "workers"):
             fixed.pop(name), described["config"].pop(name, None)
         changed = [name for name in fixed if described["config"].get(name) != fixed[name]]

@@ -114,7 +114,12 @@ def test_schedules():
     assert factors[55] == pytest.approx(0.5)
     assert factors[100] == pytest.approx(0, abs=1e-12)
     assert learning_rate_factor(TrainConfig(), 60_000) == 1
-    for options in ({"steps": 0}, {"learning_rate": 0.0}, {"ema": 1.0}):
+    ends = TrainConfig(steps=100, warmup=10, schedule="cosine", floor=0.2)
+    assert [learning_rate_factor(ends, step) for step in (10, 55, 100)] == pytest.approx([1, 0.6, 0.2])
+    steps = TrainConfig(schedule="steps", decay=0.994, decay_steps=30)
+    found = [learning_rate_factor(steps, step) for step in (0, 29, 30, 1500)]
+    assert found == pytest.approx([1, 1, 0.994, 0.994**50])
+    for options in ({"steps": 0}, {"learning_rate": 0.0}, {"ema": 1.0}, {"decay": 0.0}, {"floor": -1.0}):
         with pytest.raises(OptionError):
             TrainConfig(**options)
 
