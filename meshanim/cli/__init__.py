@@ -19,8 +19,9 @@ VERBS = {
     "demo": "the same on a recorded sentence that ships with the package",
     "train": "train a model: gava",
     "evaluate": "score models and motion on held-out data, compare scores: gava, motion, compare, ...",
-    "data": "data sets: synthesize, info, check, convert, augment-pose, cache-features",
-    "bench": "measurements that anyone can repeat: attention, animate, binding, image-loss",
+    "data": "data sets: synthesize, info, check, convert, augment-pose, personalize, ...",
+    "solve": "the motion of a mesh in, blendshape weights out",
+    "bench": "measurements that anyone can repeat: attention, animate, binding, image-loss, solve",
     "doctor": "what is installed, which backends work, how to get what is missing",
 }
 # Threads that wait by spinning slow each other down many times where other programs want the cores too.

@@ -9,6 +9,7 @@ from meshanim.cli.demo import CLIP
 from meshanim.gaussians.binding_benchmark import BindingBenchmark
 from meshanim.gaussians.loss_benchmark import LossBenchmark
 from meshanim.results import Results
+from meshanim.solve_benchmark import SolveBenchmark
 
 __all__ = ["COMMANDS"]
 
@@ -41,6 +42,13 @@ def _image_loss(options: LossBenchmark) -> None:
     _report(loss_benchmark.run(options), options.json)
 
 
+def _solve(options: SolveBenchmark) -> None:
+    from meshanim import solve_benchmark
+
+    with as_file(files("meshanim").joinpath(CLIP)) as clip:
+        _report(solve_benchmark.run(options, clip), options.json)
+
+
 def _report(results: Results, path: Path | None) -> None:
     print(results.table())
     print(", ".join(f"{key} {value}" for key, value in results.machine.items()))
@@ -48,4 +56,10 @@ def _report(results: Results, path: Path | None) -> None:
         results.save(path)
 
 
-COMMANDS = {"attention": _attention, "animate": _animate, "binding": _binding, "image-loss": _image_loss}
+COMMANDS = {
+    "attention": _attention,
+    "animate": _animate,
+    "binding": _binding,
+    "image-loss": _image_loss,
+    "solve": _solve,
+}

@@ -12,6 +12,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from meshanim.datasets.animation_preparation import StateOptions, prepare_states
 from meshanim.datasets.conversion import convert
+from meshanim.datasets.mesh_files import load_mesh
 from meshanim.datasets.motion_dataset import (
     MotionDataset,
     detect_kind,
@@ -21,10 +22,20 @@ from meshanim.datasets.motion_dataset import (
 from meshanim.datasets.pose_augmentation import AugmentPoseOptions, augment_pose
 from meshanim.datasets.synthetic.corpus import SynthesizeOptions, synthesize
 from meshanim.errors import FileFormatError, MeshanimError
+from meshanim.export import write_rig
 from meshanim.files import written_whole
+from meshanim.heads import load_head
+from meshanim.motion.personal_shapes import Method, personal_shapes
 from meshanim.training.feature_cache import CacheFeaturesOptions, cache_features
 
-__all__ = ["COMMANDS", "CheckOptions", "ConvertOptions", "InfoOptions", "ReadingOptions"]
+__all__ = [
+    "COMMANDS",
+    "CheckOptions",
+    "ConvertOptions",
+    "InfoOptions",
+    "PersonalizeOptions",
+    "ReadingOptions",
+]
 
 
 @dataclass(frozen=True)
@@ -147,6 +158,29 @@ class StatesOptions:
     """Processes; 0 takes one a core."""
     dask: str = ""
     """Address of a Dask scheduler, such as tcp://host:8786, whose workers do it instead."""
+
+
+@dataclass(frozen=True)
+class PersonalizeOptions:
+    """Give a neutral face of any topology the blendshapes of a head, ARKit's 52 by default.
+
+    Example: meshanim data personalize character.obj -o character.glb
+    """
+
+    target: Positional[Path]
+    """The face at rest, upright, facing along +z: obj, ply, glb and others."""
+    output: Annotated[Path, arg(aliases=["-o"])] = Path("rig.npz")
+    """The ending chooses: npz, glb (morph targets), or none for a folder of OBJ files. `--head rig:PATH` of
+    other verbs takes each."""
+    head: str = "default"
+    """Whose shapes, as `load_head` takes it."""
+    method: Method = "deformation_transfer"
+    """deformation_transfer, or displacement of each vertex as its counterpart."""
+    landmarks: Path | None = None
+    """JSON list of pairs [vertex of the head, vertex of the target], three or more, where shape alone does
+    not tell what is what."""
+    scale: float = 1.0
+    """Metres for one unit of the target's file: 0.01 if it is in centimetres."""
 
 
 def _synthesize(options: SynthesizeOptions) -> int:
@@ -275,6 +309,26 @@ def _cache_features(options: CacheFeaturesOptions) -> None:
     print(f"wrote {cache_features(options, progress=sys.stderr.isatty())}")
 
 
+def _personalize(options: PersonalizeOptions) -> None:
+    target = load_mesh(options.target, scale=options.scale)
+    landmarks = None if options.landmarks is None else _landmarks(options.landmarks)
+    rig = personal_shapes(load_head(options.head), target, options.method, landmarks)
+    write_rig(options.output, rig)
+    print(f"wrote {options.output}: {len(rig.names)} shapes on {len(rig.neutral)} vertices")
+
+
+def _landmarks(path: Path) -> np.ndarray:
+    try:
+        pairs = np.array(json.loads(path.read_text(encoding="utf-8")))
+    except OSError as error:
+        raise FileFormatError(f"cannot read {path}: {error.strerror or error}") from error
+    except ValueError as error:
+        raise FileFormatError(f"{path} is no JSON list of pairs: {error}") from error
+    if pairs.ndim != 2 or pairs.shape[1] != 2 or pairs.dtype.kind != "i":
+        raise FileFormatError(f"{path} is no JSON list of pairs of vertex numbers")
+    return pairs
+
+
 COMMANDS = {
     "synthesize": _synthesize,
     "info": _info,
@@ -283,4 +337,5 @@ COMMANDS = {
     "augment-pose": _augment_pose,
     "a2f": _states,
     "cache-features": _cache_features,
+    "personalize": _personalize,
 }

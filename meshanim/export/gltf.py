@@ -17,9 +17,10 @@ from jaxtyping import Float, Int
 from meshanim.errors import OptionError, ShapeError
 from meshanim.files import written_whole
 from meshanim.geometry import TriangleMesh
+from meshanim.heads import Rig
 from meshanim.motion import MeshSequence
 
-__all__ = ["GltfMaterial", "morph_basis", "write_glb"]
+__all__ = ["GltfMaterial", "morph_basis", "write_glb", "write_morph_targets"]
 
 FLOAT, UNSIGNED_INT, UNSIGNED_BYTE = 5126, 5125, 5121
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
@@ -200,6 +201,36 @@ def write_glb(
     return error
 
 
+def write_morph_targets(path: str | Path, rig: Rig) -> None:
+    """Write a rig as a still mesh with named morph targets, their names in mesh.extras.targetNames.
+
+    Parameters
+    ----------
+    path : str or Path
+        The .glb file, written whole.
+    rig : Rig
+        One vertex a vertex of the rig, or one a corner of its texture where it has one.
+    """
+    mesh = TriangleMesh(rig.neutral, rig.faces, rig.uv, rig.uv_faces)
+    buffer = _Buffer()
+    normals = _normals(mesh)
+    targets = rig.deltas.astype(np.float32)
+    changes = [_normals(mesh.with_vertices(mesh.vertices + delta)) - normals for delta in rig.deltas]
+    material = GltfMaterial("surface", np.arange(mesh.n_faces))
+    primitive = _primitive(buffer, mesh, targets, normals, changes, None, material, 0)
+    gltf = {
+        "asset": {"version": "2.0", "generator": "meshanim"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"name": "head", "mesh": 0}],
+        "meshes": [{"name": "head", "primitives": [primitive], "extras": {"targetNames": list(rig.names)}}],
+        "materials": [_material(buffer, material)],
+        **buffer.sections(),
+    }
+    with written_whole(path) as temporary:
+        temporary.write_bytes(_glb(gltf, bytes(buffer.data)))
+
+
 def _initial(weights: np.ndarray) -> dict:
     return {"weights": weights[0].tolist()} if weights.shape[1] else {}
 
@@ -230,12 +261,13 @@ def _primitive(
     if uv is not None:
         flipped = np.stack([uv[corners[:, 1], 0], 1 - uv[corners[:, 1], 1]], 1).astype(np.float32)
         attributes["TEXCOORD_0"] = buffer.accessor(flipped, "VEC2", ARRAY_BUFFER)
-    joints = np.zeros((len(vertex), 4), np.uint8)
-    joints[:, 1] = weight[vertex] > 0  # a joint without weight must be named 0
-    blend = np.zeros((len(vertex), 4), np.float32)
-    blend[:, 0], blend[:, 1] = 1 - weight[vertex], weight[vertex]
-    attributes["JOINTS_0"] = buffer.accessor(joints, "VEC4", ARRAY_BUFFER)
-    attributes["WEIGHTS_0"] = buffer.accessor(blend, "VEC4", ARRAY_BUFFER)
+    if weight is not None:
+        joints = np.zeros((len(vertex), 4), np.uint8)
+        joints[:, 1] = weight[vertex] > 0  # a joint without weight must be named 0
+        blend = np.zeros((len(vertex), 4), np.float32)
+        blend[:, 0], blend[:, 1] = 1 - weight[vertex], weight[vertex]
+        attributes["JOINTS_0"] = buffer.accessor(joints, "VEC4", ARRAY_BUFFER)
+        attributes["WEIGHTS_0"] = buffer.accessor(blend, "VEC4", ARRAY_BUFFER)
     moved = [
         {
             "POSITION": buffer.accessor(target[vertex], "VEC3", ARRAY_BUFFER, bounds=True),

@@ -6,7 +6,7 @@ from meshanim.errors import OptionError
 from meshanim.heads.default import DefaultHead, HeadPart, load_default_head
 from meshanim.heads.flame import FlameHead, load_flame
 from meshanim.heads.head import JOINT_NAMES, JOINT_PARENTS, REGION_NAMES, Head, HeadParameters
-from meshanim.heads.rig import load_rig, read_rig
+from meshanim.heads.rig import load_rig, read_rig, rig_head
 from meshanim.heads.rig_data import Rig
 from meshanim.heads.skinning import joint_transforms, linear_blend_skinning
 
@@ -26,6 +26,7 @@ __all__ = [
     "load_head",
     "load_rig",
     "read_rig",
+    "rig_head",
 ]
 
 

@@ -13,7 +13,7 @@ from meshanim.heads.gltf_morphs import read_gltf_morphs
 from meshanim.heads.head import REGION_NAMES, Head
 from meshanim.heads.rig_data import Rig
 
-__all__ = ["Rig", "load_rig", "read_rig", "rig_regions"]
+__all__ = ["Rig", "load_rig", "read_rig", "rig_head", "rig_regions"]
 
 # A vertex belongs to a region if one of these shapes moves it by more than this part of their largest move.
 SUPPORT = {
@@ -61,18 +61,23 @@ def read_rig(path: str | Path) -> Rig:
 
 
 def load_rig(path: str | Path) -> Head:
-    """A rig as a head: its blendshapes are the expressions, there is no identity, joints turn everything.
-
-    Without skinning weights the whole mesh follows the neck joint, and the jaw and eye joints move nothing;
-    the jaw is opened by its blendshape. Regions come from the file, or from what the shapes with ARKit's
-    names move.
+    """The rig of a file as a head: `rig_head` of what `read_rig` reads.
 
     Raises
     ------
     FileFormatError
         As `read_rig`.
     """
-    rig = read_rig(path)
+    return rig_head(read_rig(path))
+
+
+def rig_head(rig: Rig) -> Head:
+    """A rig as a head: its blendshapes are the expressions, there is no identity, joints turn everything.
+
+    Without skinning weights the whole mesh follows the neck joint, and the jaw and eye joints move nothing;
+    the jaw is opened by its blendshape. Regions are the rig's own, or what the shapes with ARKit's names
+    move.
+    """
     weights = np.zeros((len(rig.neutral), 5))
     weights[:, 1] = 1
     joints = np.repeat(rig.neutral.mean(0)[None], 5, axis=0)

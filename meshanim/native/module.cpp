@@ -30,8 +30,8 @@ Isa current_isa() { return selected(); }
 
 void bind_attention(nb::module_ &m);
 void bind_binding(nb::module_ &);
-void bind_image(nb::module_ &);
 void bind_boxqp(nb::module_ &);
+void bind_image(nb::module_ &);
 void bind_memory(nb::module_ &);
 void bind_noise(nb::module_ &);
 void bind_raster(nb::module_ &);
@@ -50,8 +50,8 @@ NB_MODULE(_native, m) {
     }, nb::arg("name"), "Run the kernels on another instruction set (for tests); ValueError if the processor lacks it.");
     bind_attention(m);
     bind_binding(m);
-    bind_image(m);
     bind_boxqp(m);
+    bind_image(m);
     bind_memory(m);
     bind_noise(m);
     bind_raster(m);

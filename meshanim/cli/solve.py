@@ -1,0 +1,74 @@
+"""`meshanim solve`: the motion of a mesh in, blendshape weights out."""
+
+import sys
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import OmitArgPrefixes, Positional, arg
+
+from meshanim.errors import OptionError
+from meshanim.files import check_writable
+from meshanim.heads import load_head
+from meshanim.motion import MeshSequence
+from meshanim.motion.audio2face_rig import read_solver_config
+from meshanim.motion.blendshape_solver import SolverOptions
+from meshanim.motion.personal_shapes import Method
+from meshanim.motion.solve_sequence import head_for, solve_sequence
+from meshanim.motion.vertex_sampling import sample_vertices
+
+__all__ = ["COMMANDS", "SolveOptions", "solve"]
+
+
+@dataclass(frozen=True)
+class SolveOptions:
+    """Find the blendshape weights of a mesh sequence, and say what they leave of its motion in mm.
+
+    Example: meshanim solve talk.npz -o talk.csv
+    """
+
+    motion: Positional[Path]
+    """A mesh sequence, .npz: `meshanim animate speech.wav -o talk.npz` writes one."""
+    output: Annotated[Path, arg(aliases=["-o"])] = Path("weights.csv")
+    """The ending chooses: csv (columns of Audio2Face-3D) or npz (names, weights, fps, pose)."""
+    head: str = "default"
+    """Whose shapes: default, rig:/path/face.glb or any other that `load_head` takes. A sequence of another
+    topology gets them by correspondence with its template."""
+    method: Method = "deformation_transfer"
+    """How another topology gets them."""
+    samples: int | None = None
+    """How many vertices to look at; all that shapes move if not given."""
+    config: Path | None = None
+    """Options from the JSON of an Audio2Face-3D rig, instead of the ones below."""
+    replay: Path | None = None
+    """Also write the motion that the weights make, .npz."""
+    json: Path | None = None
+    """Also write the residuals here."""
+    terms: OmitArgPrefixes[SolverOptions] = field(default_factory=SolverOptions)
+
+
+def solve(options: SolveOptions) -> None:
+    """Run the verb."""
+    for path, endings in ((options.output, (".csv", ".npz")), (options.replay, (".npz",))):
+        if path is not None and path.suffix.lower() not in endings:
+            raise OptionError(f"cannot write {path}: the ending must be {' or '.join(endings)}")
+        if path is not None:
+            check_writable(path)
+    sequence = MeshSequence.load(options.motion)
+    head = head_for(sequence, load_head(options.head), options.method)
+    terms = options.terms
+    if options.config is not None:
+        count = len(sample_vertices(head, options.samples).vertices)
+        terms = read_solver_config(options.config, head.expression_names, count)
+        terms = replace(terms, nvidia_parity=options.terms.nvidia_parity)
+    solved = solve_sequence(sequence, head, terms, options.samples, sys.stderr.isatty())
+    solved.track.save(options.output)
+    if options.replay is not None:
+        solved.motion.save(options.replay)
+    print(solved.residual.table())
+    print(f"wrote {options.output}: {len(solved.track)} frames, {len(solved.track.names)} shapes")
+    if options.json is not None:
+        solved.residual.save(options.json)
+
+
+COMMANDS = solve
