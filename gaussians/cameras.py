@@ -67,7 +67,8 @@ class Cameras:
     def to(self, *device_or_dtype: torch.device | torch.dtype | str) -> "Cameras":
         """On another device or of another type."""
         world_to_camera, intrinsics = (
-            m.to(*device_or_dtype) for m in (self.world_to_camera, self.intrinsics)
+            matrix.to(*device_or_dtype)  # type: ignore[call-overload]
+            for matrix in (self.world_to_camera, self.intrinsics)
         )
         return Cameras(world_to_camera, intrinsics, self.width, self.height)
 
