@@ -54,7 +54,7 @@ class Gaussians:
         If not exactly one of colors and sh is given.
     """
 
-    means: Float[Tensor, "*batch n 3"]
+    means: Float[Tensor, "*#batch n 3"]
     quaternions: Float[Tensor, "*#batch n 4"]
     scales: Float[Tensor, "*#batch n 3"]
     opacities: Float[Tensor, "*#batch n"]

@@ -25,6 +25,14 @@ def test_fields_share_a_batch_that_some_leave_out():
     assert gaussians.batch_shape == (2, 4)
 
 
+def test_centres_may_be_what_all_frames_share():
+    still = Gaussians(
+        torch.zeros(5, 3), torch.ones(5, 4), torch.ones(5, 3), torch.ones(5), sh=torch.zeros(3, 5, 4, 3)
+    )
+    assert still.batch_shape == (3,)
+    assert still.select(torch.tensor([1, 4])).sh.shape == (3, 2, 4, 3)
+
+
 @pytest.mark.parametrize(("coefficients", "degree"), [(1, 0), (4, 1), (9, 2), (16, 3)])
 def test_degree_of_harmonics(coefficients, degree):
     assert some(sh=torch.zeros(5, coefficients, 3)).sh_degree == degree
