@@ -389,6 +389,10 @@ class MeshanimDataset(MotionDataset):
 
     def __init__(self, directory: str | Path, options: DatasetOptions | None = None):
         super().__init__(directory, options)
+        if (self.directory / "vertices_npy").is_dir():
+            raise FileFormatError(
+                f"{self.directory} is in FaceFormer's layout: convert it (meshanim data convert)"
+            )
         if not (self.directory / "dataset.json").exists():
             raise FileFormatError(f"{self.directory} has no dataset.json: no data set, or one not finished")
         record = read_record(self.directory)

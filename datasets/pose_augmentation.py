@@ -6,7 +6,8 @@ and stored beside the zero-pose vertices, to be applied about the neck joint (`H
 """
 
 import json
-from dataclasses import dataclass
+import os
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -34,6 +35,8 @@ from meshanim.motion.video_pose import pose_from_video
 __all__ = ["AugmentPoseOptions", "augment_pose", "plot_statistics"]
 
 PROSODY_RATE = 100.0
+NEW_POSE, BEGUN = ".pose-new.npy", ".pose-begun.json"
+"""Poses of a run that is not finished, and its options."""
 TRACKS = (".npz", ".npy", "")
 VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm")
 
@@ -46,7 +49,8 @@ class AugmentPoseOptions:
     """
 
     directory: Positional[Path]
-    """Data set in the project's format (meshanim data convert makes one); its pose.npy files are replaced."""
+    """Data set in the project's format (meshanim data convert makes one); its pose.npy files are replaced
+    when all poses are made; an interrupted run is continued."""
     source: Literal["prosody", "video", "file"] = "prosody"
     """prosody: made from the sound. video: the face in NAME.mp4. file: NAME.npz, NAME.npy or folder NAME."""
     tracks: Path | None = None
@@ -78,7 +82,10 @@ class AugmentPoseOptions:
 
 
 def augment_pose(options: AugmentPoseOptions, progress: bool = True) -> PoseStatistics:
-    """Replace the pose of every sequence, each file whole; give the statistics of all of them.
+    """Replace the pose of every sequence; give the statistics of all of them.
+
+    New poses stand beside the old ones until all are made: a track that is damaged changes nothing, and a run
+    with the same options goes on where one was interrupted.
 
     Raises
     ------
@@ -91,9 +98,15 @@ def augment_pose(options: AugmentPoseOptions, progress: bool = True) -> PoseStat
     for name in dataset.sequences:
         if options.source != "prosody":
             _track_file(options, name)
-    done = run_jobs(partial(_augment, options), list(dataset.sequences), options.workers)
-    for _ in tqdm(done, total=len(dataset), unit="clip", desc="pose", disable=not progress):
+    begun = _begin(options, dataset)
+    left = [name for name in dataset.sequences if not _new_pose(dataset, name).exists()]
+    done = run_jobs(partial(_augment, options), left, options.workers)
+    for _ in tqdm(
+        done, "pose", len(dataset), initial=len(dataset) - len(left), unit="clip", disable=not progress
+    ):
         pass
+    for name in dataset.sequences:
+        os.replace(_new_pose(dataset, name), dataset.directory / "sequences" / name / "pose.npy")
     path = dataset.directory / "dataset.json"
     record = json.loads(path.read_text(encoding="utf-8"))
     record["pose"] = {
@@ -105,11 +118,29 @@ def augment_pose(options: AugmentPoseOptions, progress: bool = True) -> PoseStat
     }
     with written_whole(path) as temporary:
         temporary.write_text(json.dumps(record, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    begun.unlink()
     tracks = [PoseTrack(np.asarray(dataset.motion(name).pose), dataset.fps) for name in dataset.sequences]
     statistics = pose_statistics(tracks)
     if options.plot is not None:
         plot_statistics(statistics, options.plot)
     return statistics
+
+
+def _new_pose(dataset: MeshanimDataset, name: str) -> Path:
+    return dataset.directory / "sequences" / name / NEW_POSE
+
+
+def _begin(options: AugmentPoseOptions, dataset: MeshanimDataset) -> Path:
+    """The file that says what the new poses are; those of other options are deleted."""
+    path = dataset.directory / BEGUN
+    free = ("directory", "plot", "workers")
+    wanted = json.dumps({key: str(value) for key, value in asdict(options).items() if key not in free})
+    if not path.exists() or path.read_text(encoding="utf-8") != wanted:
+        for name in dataset.sequences:
+            _new_pose(dataset, name).unlink(missing_ok=True)
+        with written_whole(path) as temporary:
+            temporary.write_text(wanted, encoding="utf-8")
+    return path
 
 
 def _augment(options: AugmentPoseOptions, name: str) -> str:
@@ -137,8 +168,7 @@ def _augment(options: AugmentPoseOptions, name: str) -> str:
         track = center_rotations(track)
     if options.sigma > 0:
         track = smooth_rotations(track, options.sigma, options.window)
-    target = dataset.directory / "sequences" / name / "pose.npy"
-    with written_whole(target) as temporary, open(temporary, "wb") as file:
+    with written_whole(_new_pose(dataset, name)) as temporary, open(temporary, "wb") as file:
         np.save(file, (options.gain * track).astype(np.float32))
     return name
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from meshanim.audio import Waveform
 from meshanim.cli import main
-from meshanim.datasets import MeshanimDataset, MotionSequence, SequenceInfo, Subject
+from meshanim.datasets import MeshanimDataset, MotionSequence, SequenceInfo, Subject, pose_augmentation
 from meshanim.datasets.meshanim_format import write_dataset, write_sequence, write_subject
 from meshanim.datasets.pose_augmentation import AugmentPoseOptions, augment_pose
 from meshanim.errors import FileFormatError, OptionError
@@ -92,6 +92,49 @@ def test_missing_and_bad_tracks_leave_the_data_alone(corpus, tmp_path):
         AugmentPoseOptions(corpus, window=4)
     for name, old in zip(dataset.sequences, before):
         assert np.array_equal(dataset.motion(name).pose, old)
+
+
+def test_a_damaged_track_changes_nothing_and_the_run_goes_on(corpus, tmp_path, monkeypatch):
+    dataset = MeshanimDataset(corpus)
+    second = dataset.sequences[1]
+    tracks = tmp_path / "tracks"
+    tracks.mkdir()
+    for name in dataset.sequences:
+        np.savez(tracks / f"{name}.npz", rotation=np.full((80, 3), 0.1), fps=25.0)
+    good = (tracks / f"{second}.npz").read_bytes()
+    (tracks / f"{second}.npz").write_bytes(good[: len(good) // 2])
+    before = {path: path.read_bytes() for path in corpus.rglob("*") if path.is_file()}
+    options = AugmentPoseOptions(corpus, "file", tracks, workers=1)
+    with pytest.raises(FileFormatError, match=second):
+        augment_pose(options, progress=False)
+    assert all(path.read_bytes() == data for path, data in before.items())
+    (tracks / f"{second}.npz").write_bytes(good)
+    made, load = [], pose_augmentation.load_pose_track
+    monkeypatch.setattr(
+        pose_augmentation, "load_pose_track", lambda path, fps: made.append(path.stem) or load(path, fps)
+    )
+    augment_pose(options, progress=False)
+    assert made == [second]
+    assert all(np.allclose(dataset.motion(name).pose, 0.1, atol=1e-6) for name in dataset.sequences)
+    assert {path for path in corpus.rglob("*") if path.is_file()} == set(before)
+
+
+def test_poses_of_other_options_are_not_taken_up(corpus, tmp_path):
+    dataset = MeshanimDataset(corpus)
+    first, second = dataset.sequences
+    np.savez(tmp_path / f"{first}.npz", rotation=np.full((80, 3), 0.1), fps=25.0)
+    (tmp_path / f"{second}.npz").write_bytes(b"damaged")
+    with pytest.raises(FileFormatError, match=second):
+        augment_pose(AugmentPoseOptions(corpus, "file", tmp_path, workers=1), progress=False)
+    np.savez(tmp_path / f"{second}.npz", rotation=np.full((80, 3), 0.1), fps=25.0)
+    augment_pose(AugmentPoseOptions(corpus, "file", tmp_path, gain=2.0, workers=1), progress=False)
+    assert all(np.allclose(dataset.motion(name).pose, 0.2, atol=1e-6) for name in dataset.sequences)
+
+
+def test_faceformers_layout_is_named(corpus):
+    (corpus / "vertices_npy").mkdir()
+    with pytest.raises(FileFormatError, match="FaceFormer's layout"):
+        augment_pose(AugmentPoseOptions(corpus, workers=1), progress=False)
 
 
 def test_the_command_prints_and_plots(corpus, tmp_path, capsys):
