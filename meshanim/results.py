@@ -26,7 +26,7 @@ class MetricValue:
     unit : str
         mm, m^2, biwi, share, deg, ...
     mask : str
-        Name of the vertices that count; "all".
+        Name of the vertices that count; "all", or "none" for what is not of vertices.
     vertices : int
         How many those are.
     digest : str
@@ -170,7 +170,7 @@ class Results:
         names = list(dict.fromkeys(row.implementation for row, _ in rows))
         lines: dict[tuple[str, ...], dict[str, str]] = {}
         for row, measured in rows:
-            mask = f"{measured.mask} ({measured.vertices})"
+            mask = f"{measured.mask} ({measured.vertices})" if measured.vertices else measured.mask
             cells = lines.setdefault((row.case, row.metric, row.unit, mask), {})
             cells[row.implementation] = f"{row.value:.4g}"
         table = [["case", "metric", "unit", "mask (vertices)", *names]]

@@ -81,7 +81,7 @@ def _errors(model: Gava, dataset: MeshanimDataset, encoder: SpeechEncoder, label
         sequence = dataset[name]
         true = torch.from_numpy(np.array(sequence.vertices))
         template = torch.from_numpy(dataset.subjects[sequence.info.subject].template)
-        moved, still = torch.from_numpy(predict(sequence)), template.expand_as(true)
+        moved, still = torch.from_numpy(predict(sequence).vertices), template.expand_as(true)
         pair = [float(mean_vertex_error(one, true)) * 1000 for one in (moved, still)]
         found.setdefault("mean vertex error, mm", []).append((pair[0], pair[1]))
         if lips is not None:

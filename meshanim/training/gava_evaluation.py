@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -29,7 +30,23 @@ OPEN_VOWELS = ("AA", "AE", "AY", "AW", "AO")
 CLOSED_BELOW, OPEN_ABOVE = 1e-3, 4e-3
 """Metres of lip aperture that count as closed lips and as an open mouth where there is no truth."""
 
-Motion = Float32[np.ndarray, "frames vertices 3"]
+
+class Predicted(NamedTuple):
+    """What a method says of a sequence.
+
+    Parameters
+    ----------
+    vertices : (T, V, 3) float32
+        Zero pose.
+    pose : (T, 3) float32, optional
+        Head rotation, axis-angle, radians; None from a network without a pose token.
+    """
+
+    vertices: Float32[np.ndarray, "frames vertices 3"]
+    pose: Float32[np.ndarray, "frames 3"] | None
+
+
+Method = Callable[[MotionSequence], Predicted]
 
 
 @dataclass(frozen=True)
@@ -72,7 +89,7 @@ def evaluate_gava(options: EvaluateGavaOptions, progress: bool = True) -> Result
         models[describe(name, model)] = model
     head = load_head(dataset.head) if dataset.head else None
     masks = masks_of_head(head)
-    methods: dict[str, Callable[[MotionSequence], Motion]] = {}
+    methods: dict[str, Method] = {}
     for name, model in models.items():
         encoder = load_encoder(model.config.encoder)
         methods[name] = speaker(model, encoder, dataset, None)
@@ -103,7 +120,11 @@ def evaluate_gava(options: EvaluateGavaOptions, progress: bool = True) -> Result
                 encoder = load_encoder(model.config.encoder)
                 for label, seal in ((name, None), (f"{name} + lip seal", head_lip_seal(head))):
                     moved = (
-                        (spoken(model, encoder, clip.waveform, seal=seal), clip.phonemes, model.config.fps)
+                        (
+                            spoken(model, encoder, clip.waveform, seal=seal).vertices,
+                            clip.phonemes,
+                            model.config.fps,
+                        )
                         for clip in clips
                     )
                     for metric, share in articulation(moved, masks.lip_pairs).items():
@@ -155,12 +176,17 @@ def mean_displacement(dataset: MeshanimDataset) -> Float32[np.ndarray, "vertices
     return (total / max(frames, 1)).astype(np.float32)
 
 
-def held_still(dataset: MeshanimDataset) -> dict[str, Callable[[MotionSequence], Motion]]:
+def held_still(dataset: MeshanimDataset) -> dict[str, Method]:
     """Baselines that do not move: the training frames' mean displacement, and none."""
     mean = mean_displacement(dataset)
 
-    def resting(moved: Float32[np.ndarray, "vertices 3"]) -> Callable[[MotionSequence], Motion]:
-        return lambda s: np.repeat((dataset.subjects[s.info.subject].template + moved)[None], len(s), 0)
+    def resting(moved: Float32[np.ndarray, "vertices 3"]) -> Method:
+        def predict(sequence: MotionSequence) -> Predicted:
+            frame = dataset.subjects[sequence.info.subject].template + moved
+            still = np.zeros((len(sequence), 3), np.float32)
+            return Predicted(np.repeat(frame[None], len(sequence), 0), still)
+
+        return predict
 
     return {"mean of training": resting(mean), "template held still": resting(np.zeros_like(mean))}
 
@@ -174,31 +200,30 @@ def spoken(
     frames: int | None = None,
     fps: float | None = None,
     seal: LipSeal | None = None,
-) -> Motion:
-    """Vertices of a whole speech, zero pose, as the animator gives them without idle motion."""
+) -> Predicted:
+    """Vertices and head pose of a whole speech, as the animator gives them without idle motion."""
     fps = model.config.fps if fps is None else fps
     stream = GavaStream(
         model,
         None if template is None else torch.from_numpy(template),
         style,
         fps,
-        PoseSmoothing(0),
+        PoseSmoothing(),
         seal,
         None if seal is None else getattr(encoder, "bilabial", None),
     )
     mel = log_mel(audio) if model.config.pose else None
     count = frame_count(audio, fps) if frames is None else frames
-    parts = animate(stream, encoder(audio).float(), mel, count)
-    return torch.cat([part.vertices for part in parts]).numpy()
+    parts = list(animate(stream, encoder(audio).float(), mel, count))
+    pose = torch.cat([part.pose for part in parts]).numpy() if model.config.pose else None
+    return Predicted(torch.cat([part.vertices for part in parts]).numpy(), pose)
 
 
-def speaker(
-    model: Gava, encoder: SpeechEncoder, dataset: MeshanimDataset, seal: LipSeal | None
-) -> Callable[[MotionSequence], Motion]:
+def speaker(model: Gava, encoder: SpeechEncoder, dataset: MeshanimDataset, seal: LipSeal | None) -> Method:
     """A function that speaks a sequence with its subject's template, style and emotion."""
     known = model.config
 
-    def predict(sequence: MotionSequence) -> Motion:
+    def predict(sequence: MotionSequence) -> Predicted:
         info = sequence.info
         subject = info.subject if info.subject in known.subjects else None
         emotion = info.emotion if info.emotion in known.emotions else "neutral"
@@ -213,12 +238,12 @@ def speaker(
 def measure(
     dataset: MeshanimDataset,
     names: Sequence[str],
-    predict: Callable[[MotionSequence], Motion],
+    predict: Method,
     evaluation: MotionEvaluation,
     label: str,
     progress: bool,
 ) -> list[MetricValue]:
-    """Score sequences one after the other.
+    """Score sequences one after the other; the pose where heads turn in the data set.
 
     Parameters
     ----------
@@ -227,7 +252,7 @@ def measure(
     names : sequence of str
         Of the sequences, such as a split's.
     predict : function
-        A sequence to its vertices, as `speaker` gives it.
+        A sequence to its vertices and pose, as `speaker` gives it.
     evaluation : MotionEvaluation
         Fresh.
     label : str
@@ -237,12 +262,15 @@ def measure(
     """
     for name in tqdm(names, desc=label, unit="clip", disable=not progress):
         sequence = dataset[name]
+        vertices, pose = predict(sequence)
         evaluation.add(
             name,
-            torch.from_numpy(predict(sequence))[None],
+            torch.from_numpy(vertices)[None],
             torch.from_numpy(np.array(sequence.vertices)),
             torch.from_numpy(dataset.subjects[sequence.info.subject].template),
             [(p.start, p.end) for p in sequence.phonemes if p.symbol in BILABIALS],
+            torch.from_numpy(pose) if pose is not None and sequence.pose.any() else None,
+            torch.from_numpy(np.array(sequence.pose)),
         )
     return evaluation.values()
 

@@ -1,5 +1,6 @@
 import json
 import pickle
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -142,7 +143,9 @@ def test_npz_with_pose(folders):
         np.savez(path.with_suffix(".npz"), vertices=vertices, pose=pose, fps=FPS, other=generator.normal())
     found = evaluate_motion(options(folders), False)
     assert numbers(found)["pose error"] == pytest.approx(np.degrees(0.1))
-    assert next(r for r in found.results.rows if r.metric == "pose error").measured.sequences == 1
+    measured = next(r for r in found.results.rows if r.metric == "pose error").measured
+    assert (measured.sequences, measured.mask, measured.vertices) == (1, "none", 0)
+    assert re.search(r"pose error +deg +none ", found.results.metrics_table())
     with pytest.raises(OptionError, match="has 25 frames a second, the recordings 30"):
         evaluate_motion(options(folders, fps=30.0), False)
 

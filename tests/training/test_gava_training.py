@@ -37,12 +37,29 @@ def options(corpus, output, **changes):
     return TrainGavaOptions(**(defaults | changes))
 
 
-def errors(corpus, models):
-    first, *others = map(str, models)
+def errors(corpus, models, metric="mean vertex error"):
+    first, *others = models
     results = evaluate_gava(
-        EvaluateGavaOptions(corpus, first, tuple(others), splits=("train", "test")), False
+        EvaluateGavaOptions(corpus, str(first), tuple(others), splits=("train", "test")), False
     )
-    return {(r.case, r.implementation): r.value for r in results.rows if r.metric == "mean vertex error"}
+    return {(r.case, r.implementation): r.value for r in results.rows if r.metric == metric}
+
+
+def test_the_pose_is_scored_where_a_network_has_one(corpus, tmp_path):
+    brief = TrainConfig(steps=2, learning_rate=5e-3, log_every=1000, save_every=1000)
+    one = train_gava(options(corpus, tmp_path / "posed", train=brief), progress=False)
+    other = train_gava(options(corpus, tmp_path / "stiff", train=brief, pose=False), progress=False)
+    found = errors(corpus, [one, other], "pose error")
+    dataset = MeshanimDataset(corpus)
+    turned = np.concatenate([np.linalg.norm(dataset[name].pose, axis=1) for name in dataset.split("test")])
+    assert found["test", "template held still"] == pytest.approx(np.degrees(turned.mean()), rel=1e-4)
+    assert found["test", "LG+GAVA (posed)"] < 20
+    assert ("test", "LG+GAVA (stiff)") not in found
+    still = shutil.copytree(corpus, tmp_path / "still")
+    for name in dataset.sequences:
+        path = still / "sequences" / name / "pose.npy"
+        np.save(path, 0 * np.load(path))
+    assert errors(still, [one], "pose error") == {}
 
 
 def test_it_learns_to_speak_from_a_random_start(corpus, tmp_path):

@@ -12,6 +12,7 @@ this too: lip errors pool frames, dynamics deviations pool sequences.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal
 
 import torch
@@ -385,6 +386,10 @@ class PoseError(SequenceMetric):
     def update(self, predicted: Float[Tensor, "frames 3"], true: Float[Tensor, "true_frames 3"]) -> None:
         """Take one sequence of axis-angle poses, radians."""
         self.add(pose_error(predicted, true), len(true))
+
+    def summary(self, vertices: int = 0) -> MetricValue:
+        """As of every metric; it looks at no vertices."""
+        return replace(super().summary(), mask="none", vertices=0)
 
 
 class FrechetDistance(SequenceMetric):
