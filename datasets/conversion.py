@@ -94,6 +94,8 @@ def convert_sequence(job: SequenceJob) -> tuple[str, str]:
     except MeshanimError as error:
         if job.skip_defects:
             return job.name, str(error)
+        if isinstance(error, FileFormatError):
+            raise FileFormatError(f"{error} (--skip-defects leaves out {job.name})") from error
         raise
     sound = dataset.audio_file(job.name)
     if sound is not None and sound.suffix.lower() != ".wav":

@@ -184,7 +184,11 @@ def compare(options: CompareOptions) -> list[Difference]:
             if name != reference:
                 found.append(_difference(case, name, base, measured, options))
     if not found:
-        raise OptionError(f"nothing else is measured on what {reference} is measured on")
+        cases = {
+            name: sorted({case for (case, _), cells in table.items() if name in cells}) for name in names
+        }
+        measured = "; ".join(f"{name} on {', '.join(where)}" for name, where in cases.items())
+        raise OptionError(f"nothing is measured as {reference} is: {measured}")
     return found
 
 

@@ -183,6 +183,15 @@ def test_numbers_of_a_whole_set_have_no_interval(tmp_path, hard):
     assert (other.difference, other.interval, other.excludes_zero) == (1.5, None, False)
 
 
+def test_what_has_nothing_in_common_is_told(tmp_path, hard):
+    for case in ("val", "test"):
+        results = Results(case)
+        results.add_measured(case, f"of {case}", measured(hard))
+        results.save(tmp_path / f"{case}.json")
+    with pytest.raises(OptionError, match="of val is: of val on val; of test on test"):
+        compare(CompareOptions((tmp_path / "val.json", tmp_path / "test.json")))
+
+
 def test_command_line(tmp_path, hard, capsys):
     a = written(tmp_path / "a.json", ours=measured(hard))
     b = written(tmp_path / "b.json", theirs=measured(hard + 1))

@@ -76,7 +76,7 @@ class AblationOptions:
     """
 
     data: Path
-    """Folder of a data set; docs/gava.md has the command that made the published one's."""
+    """Folder of a data set; docs/gava-ablation.md has the commands of its table."""
     output: Path = Path("runs/gava-ablation")
     """Gets a folder a network; what is finished or begun there with the same options is not done again."""
     steps: int = 4000
