@@ -187,8 +187,8 @@ def compare(options: CompareOptions) -> list[Difference]:
         cases = {
             name: sorted({case for (case, _), cells in table.items() if name in cells}) for name in names
         }
-        measured = "; ".join(f"{name} on {', '.join(where)}" for name, where in cases.items())
-        raise OptionError(f"nothing is measured as {reference} is: {measured}")
+        told = "; ".join(f"{name} on {', '.join(where)}" for name, where in cases.items())
+        raise OptionError(f"nothing is measured as {reference} is: {told}")
     return found
 
 
