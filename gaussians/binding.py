@@ -199,8 +199,7 @@ class Binding:
             )
         sh = local.sh
         if rotate_sh and sh is not None:
-            rotation = triangle_frames(vertices, self.faces).rotation
-            sh = rotate_harmonics(sh, rotation.index_select(-3, self.face))
+            sh = rotate_harmonics(sh, triangle_frames(vertices, self.faces).rotation, self.face)
         return Gaussians(means, quaternions, scales, local.opacities, local.colors, sh)
 
     def _reference(
@@ -246,7 +245,7 @@ class Binding:
         quaternions = roma.quat_xyzw_to_wxyz(roma.quat_product(*torch.broadcast_tensors(turn, own)))
         sh = world.sh
         if rotate_sh and sh is not None:
-            sh = rotate_harmonics(sh, back)
+            sh = rotate_harmonics(sh, frames.rotation.mT, self.face)
         return Gaussians(means, quaternions, world.scales / scale, world.opacities, world.colors, sh)
 
     def initial_gaussians(

@@ -4,7 +4,7 @@ from functools import cache
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from meshanim.errors import OptionError, ShapeError
@@ -64,8 +64,10 @@ def harmonics(directions: Float[Tensor, "*batch 3"], degree: int) -> Float[Tenso
 
 
 def rotate_harmonics(
-    coefficients: Float[Tensor, "*#batch coefficients channels"], rotation: Float[Tensor, "*#batch 3 3"]
-) -> Float[Tensor, "*batch coefficients channels"]:
+    coefficients: Float[Tensor, "*#batch n coefficients channels"],
+    rotation: Float[Tensor, "*#batch rotations 3 3"],
+    which: Int[Tensor, " n"] | None = None,
+) -> Float[Tensor, "*batch n coefficients channels"]:
     """Coefficients of the rotated function: in direction R d it has the value that the old one has in d.
 
     Exact, as each degree is closed under rotation: the matrix of degree l maps the values of its 2 l + 1
@@ -73,10 +75,12 @@ def rotate_harmonics(
 
     Parameters
     ----------
-    coefficients : (..., K, C) float
+    coefficients : (..., N, K, C) float
         K = 1, 4, 9 or 16.
-    rotation : (..., 3, 3) float
+    rotation : (..., R, 3, 3) float
         Rotation matrices.
+    which : (N,) int, optional
+        The rotation that each takes; the one of its own index if not given.
 
     Raises
     ------
@@ -87,19 +91,24 @@ def rotate_harmonics(
     if count not in COEFFICIENTS:
         raise ShapeError(f"coefficients must be 1, 4, 9 or 16, not {count}")
     degree = COEFFICIENTS.index(count)
-    rotated = [coefficients[..., :1, :].expand(*_batch(coefficients, rotation), -1, -1)]
+    batch = torch.broadcast_shapes(coefficients.shape[:-3], rotation.shape[:-3])
+    rotated = [coefficients[..., :1, :].expand(*batch, -1, -1, -1)]
     for level in range(1, degree + 1):
-        directions, to_coefficients = _samples(level)
-        # Row vectors: d R is the direction R^T d.
-        turned = directions.to(rotation) @ rotation
-        start, end = COEFFICIENTS[level - 1], COEFFICIENTS[level]
-        matrix = to_coefficients.to(rotation) @ harmonics(turned, level)[..., start:end]
-        rotated.append(matrix @ coefficients[..., start:end, :])
+        matrix = _rotation_of_degree(level, rotation)
+        if which is not None:
+            matrix = matrix.index_select(-3, which)
+        part = coefficients[..., COEFFICIENTS[level - 1] : COEFFICIENTS[level], :]
+        rotated.append((matrix[..., None] * part[..., None, :]).sum(-3))
     return torch.cat(rotated, -2)
 
 
-def _batch(coefficients: Tensor, rotation: Tensor) -> torch.Size:
-    return torch.broadcast_shapes(coefficients.shape[:-2], rotation.shape[:-2])
+def _rotation_of_degree(level: int, rotation: Tensor) -> Tensor:
+    """(..., R, 2 l + 1, 2 l + 1): rows are old coefficients, columns new ones."""
+    directions, to_coefficients = _samples(level)
+    # Plain matrix products of many rows: batches of small ones are slow. Columns are R^T d.
+    turned = (rotation.mT.reshape(-1, 3) @ directions.to(rotation).T).reshape(*rotation.shape[:-1], -1)
+    values = harmonics(turned.mT, level)[..., COEFFICIENTS[level - 1] :].mT
+    return values @ to_coefficients.to(rotation).T
 
 
 @cache

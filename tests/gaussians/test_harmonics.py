@@ -76,4 +76,4 @@ def test_other_numbers_are_named():
     with pytest.raises(OptionError, match="not 4"):
         harmonics(torch.zeros(3), 4)
     with pytest.raises(ShapeError, match="not 5"):
-        rotate_harmonics(torch.zeros(2, 5, 3), torch.eye(3))
+        rotate_harmonics(torch.zeros(2, 5, 3), torch.eye(3)[None])
