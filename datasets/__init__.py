@@ -1,6 +1,7 @@
 """Talking-head data sets."""
 
 from meshanim.datasets.biwi import BiwiDataset, BiwiOptions
+from meshanim.datasets.capture import Capture, Picture, View, open_capture
 from meshanim.datasets.conversion import convert
 from meshanim.datasets.faceformer import FaceFormerDataset, FaceFormerOptions
 from meshanim.datasets.mesh_folder import MeshFolderDataset, MeshFolderOptions
@@ -18,6 +19,7 @@ from meshanim.datasets.vocaset import VocasetDataset, VocasetOptions
 __all__ = [
     "BiwiDataset",
     "BiwiOptions",
+    "Capture",
     "DatasetOptions",
     "FaceFormerDataset",
     "FaceFormerOptions",
@@ -26,10 +28,13 @@ __all__ = [
     "MeshanimDataset",
     "MotionDataset",
     "MotionSequence",
+    "Picture",
     "SequenceInfo",
     "Subject",
+    "View",
     "VocasetDataset",
     "VocasetOptions",
     "convert",
+    "open_capture",
     "open_dataset",
 ]

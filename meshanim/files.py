@@ -1,14 +1,20 @@
 """Output files are written whole: to a temporary file beside the target, then renamed."""
 
+import json
 import os
 import tempfile
+import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from meshanim.errors import FileFormatError
 
-__all__ = ["check_writable", "written_whole"]
+__all__ = ["check_writable", "read_json", "read_npz", "written_whole"]
 
 
 @contextmanager
@@ -47,6 +53,43 @@ def check_writable(path: str | Path) -> None:
         If the folder does not exist or cannot be written to, or `path` is a folder.
     """
     _temporary_beside(Path(path)).unlink()
+
+
+def read_json(path: str | Path) -> Any:
+    """What a JSON file holds.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is missing, cut short or no JSON.
+    """
+    try:
+        return json.loads(Path(path).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise FileFormatError(f"cannot read {path}: {error}") from error
+
+
+def read_npz(path: str | Path) -> dict[str, np.ndarray]:
+    """The arrays of an .npz by name; nothing is unpickled.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is missing, cut short, no .npz, or holds objects.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except (
+        OSError,
+        ValueError,
+        EOFError,
+        AttributeError,
+        TypeError,
+        zipfile.BadZipFile,
+        zlib.error,
+    ) as error:
+        raise FileFormatError(f"cannot read {path}: {error}") from error
 
 
 def _temporary_beside(path: Path) -> Path:

@@ -1,7 +1,6 @@
 """The embedded corpus: who speaks which sentence how, acted out and written."""
 
 import hashlib
-import json
 import math
 import shutil
 from dataclasses import asdict, dataclass, replace
@@ -25,11 +24,11 @@ from meshanim.datasets.meshanim_format import (
     write_sequence,
     write_subject,
 )
+from meshanim.datasets.synthetic.claim import claim_folder
 from meshanim.datasets.synthetic.performance import CURVE_NAMES, Performance, perform
 from meshanim.datasets.synthetic.sentences import SENTENCES
 from meshanim.datasets.synthetic.style import EMOTIONS, SpeakingStyle
 from meshanim.errors import DependencyError, FileFormatError, OptionError
-from meshanim.files import written_whole
 from meshanim.heads import Head, HeadParameters, load_head
 from meshanim.jobs import run_jobs
 
@@ -337,34 +336,6 @@ def _done(options: SynthesizeOptions, take: Take) -> bool:
     return (options.directory / "sequences" / _name(take) / "sequence.json").exists()
 
 
-def _claim(options: SynthesizeOptions) -> None:
-    """Make the folder ours: new, or begun with the same options; remove what was half written."""
-    path = options.directory / "synthesis.json"
-    if path.exists():
-        try:
-            begun = json.loads(path.read_text(encoding="utf-8"))
-        except ValueError as error:
-            raise FileFormatError(
-                f"{path} is damaged: {error}; delete the folder or choose another"
-            ) from error
-        other = [key for key, value in options.recorded.items() if begun.get(key) != value]
-        if other:
-            kept = ", ".join(f"{key} {begun.get(key)}" for key in other)
-            raise OptionError(
-                f"{options.directory} was begun with {kept}; choose another folder or delete it"
-            )
-    else:
-        if options.directory.exists() and any(options.directory.iterdir()):
-            raise OptionError(f"{options.directory} is not empty and holds no corpus; choose another folder")
-        try:
-            options.directory.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise FileFormatError(f"cannot write {options.directory}: {error.strerror}") from error
-        with written_whole(path) as temporary:
-            temporary.write_text(json.dumps(options.recorded, indent=1) + "\n", encoding="utf-8")
-    _remove_half_written(options)
-
-
 def _remove_half_written(options: SynthesizeOptions) -> None:
     for folder in ("sequences", "wav", "vertices_npy"):
         for left in (options.directory / folder).glob(".*"):
@@ -401,7 +372,8 @@ def synthesize(options: SynthesizeOptions, progress: bool = True) -> Path:
         raise DependencyError("py-nanotts", "speech")
     members = cast(options, len(head.shape_names), available)
     everything = takes(options, members)
-    _claim(options)
+    claim_folder(options.directory, options.recorded, "corpus")
+    _remove_half_written(options)
     missing = [take for take in everything if not _done(options, take)]
     with tqdm(total=len(everything), initial=len(everything) - len(missing), disable=not progress) as bar:
         bar.set_description("sequences")

@@ -1,4 +1,4 @@
-"""`meshanim data`: make, describe, check and convert data sets."""
+"""`meshanim data`: make, describe, check and convert data sets and captures."""
 
 import json
 import sys
@@ -11,6 +11,8 @@ import numpy as np
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from meshanim.datasets.animation_preparation import StateOptions, prepare_states
+from meshanim.datasets.capture import Capture, detect_capture, open_capture
+from meshanim.datasets.capture_folder import write_capture
 from meshanim.datasets.conversion import convert
 from meshanim.datasets.mesh_files import load_mesh
 from meshanim.datasets.motion_dataset import (
@@ -20,8 +22,10 @@ from meshanim.datasets.motion_dataset import (
     open_dataset,
 )
 from meshanim.datasets.pose_augmentation import AugmentPoseOptions, augment_pose
+from meshanim.datasets.synthetic.capture import CaptureOptions, synthesize_capture
 from meshanim.datasets.synthetic.corpus import SynthesizeOptions, synthesize
-from meshanim.errors import FileFormatError, MeshanimError
+from meshanim.datasets.vhap import write_vhap
+from meshanim.errors import FileFormatError, MeshanimError, OptionError
 from meshanim.export import write_rig
 from meshanim.files import written_whole
 from meshanim.heads import load_head
@@ -122,8 +126,11 @@ class ConvertOptions:
     """The folder to read."""
     target: Positional[Path]
     """The folder to write; an interrupted run is continued."""
-    format: Literal["meshanim", "faceformer"] = "meshanim"
-    """meshanim, or faceformer: wav/, vertices_npy/, templates.pkl, and the rest beside them."""
+    format: Literal["meshanim", "faceformer", "folder", "vhap"] = "meshanim"
+    """meshanim, or faceformer: wav/, vertices_npy/, templates.pkl, and the rest beside them. Of a capture
+    (docs/capture.md): folder, the plain one, or vhap."""
+    image_scale: float = 1.0
+    """Pixels a side of a capture's pictures, as a share of what they have."""
     reading: OmitArgPrefixes[ReadingOptions] = ReadingOptions()
     """How to read it."""
     skip_defects: bool = False
@@ -183,9 +190,32 @@ class PersonalizeOptions:
     """Metres for one unit of the target's file: 0.01 if it is in centimetres."""
 
 
-def _synthesize(options: SynthesizeOptions) -> int:
-    directory = synthesize(options, progress=sys.stderr.isatty())
-    print(f"wrote {directory}")
+@dataclass(frozen=True)
+class SynthesizeCommand:
+    """Write a talking-head corpus, synthetic speech and a head that speaks it; or pictures of it (--images).
+
+    Example: meshanim data synthesize corpus --subjects 8 --sentences 40 --fps 30 --seed 0
+
+    Pictures: meshanim data synthesize capture --images --views 16 --names bruno
+    """
+
+    corpus: OmitArgPrefixes[SynthesizeOptions]
+    """Who speaks what, and where it is written."""
+    images: bool = False
+    """Write pictures from many cameras (docs/capture.md) instead of the corpus: a folder a person."""
+    capture: OmitArgPrefixes[CaptureOptions] = field(default_factory=CaptureOptions)
+    """How --images are taken."""
+
+
+def _synthesize(options: SynthesizeCommand) -> int:
+    progress = sys.stderr.isatty()
+    if options.images:
+        for folder in synthesize_capture(options.corpus, options.capture, progress):
+            print(f"wrote {folder}")
+        return 0
+    if options.capture != CaptureOptions():
+        raise OptionError("--views, --people and the other options of pictures need --images")
+    print(f"wrote {synthesize(options.corpus, progress=progress)}")
     return 0
 
 
@@ -232,7 +262,61 @@ def _write_json(path: Path | None, record: Mapping[str, Any]) -> None:
             temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
 
 
+def _capture_description(capture: Capture) -> dict[str, Any]:
+    timesteps = {view.timestep for view in capture.views}
+    return {
+        "name": capture.name,
+        "kind": capture.kind,
+        "pictures": len(capture),
+        "camera_positions": len({view.world_to_camera.tobytes() for view in capture.views}),
+        "timesteps": len(timesteps),
+        "sizes": sorted({(view.width, view.height) for view in capture.views}),
+        "head": capture.head_name,
+        "tracked": capture.parameters is not None,
+        "regions": list(capture.region_names),
+        "triangles": len(capture.surface.faces) if capture.surface else 0,
+        "splits": {split: len(indices) for split, indices in capture.splits.items()},
+    }
+
+
+def _print_capture(about: Mapping[str, Any]) -> None:
+    splits = ", ".join(f"{count} {split}" for split, count in about["splits"].items())
+    sizes = ", ".join(f"{width} x {height}" for width, height in about["sizes"])
+    head = f"head {about['head'] or 'not named'}" if about["tracked"] else "no parameters of a head"
+    print(f"{about['name']} ({about['kind']} layout)")
+    print(f"{about['pictures']} pictures of {sizes} ({splits})")
+    print(f"{about['camera_positions']} camera positions, {about['timesteps']} timesteps, {head}")
+    print(f"regions: {', '.join(about['regions']) or 'none'}")
+
+
+def _of_capture(options: InfoOptions | CheckOptions) -> bool:
+    return options.reading.kind == "auto" and detect_capture(options.directory) is not None
+
+
+def _check_capture(options: CheckOptions) -> int:
+    about = None
+    try:
+        capture = open_capture(options.directory)
+    except FileFormatError as error:
+        defects = [str(error)]
+    else:
+        defects = capture.check(sys.stderr.isatty())
+        about = _capture_description(capture)
+    for defect in defects:
+        print(defect, file=sys.stderr)
+    if about is not None:
+        _print_capture(about)
+    print(f"{len(defects)} defects")
+    _write_json(options.json, {"defects": defects, "dataset": about})
+    return 1 if defects else 0
+
+
 def _info(options: InfoOptions) -> int:
+    if _of_capture(options):
+        about = _capture_description(open_capture(options.directory))
+        _print_capture(about)
+        _write_json(options.json, about)
+        return 0
     about = _description(options.reading.open(options.directory))
     _print_description(about)
     _write_json(options.json, about)
@@ -240,6 +324,8 @@ def _info(options: InfoOptions) -> int:
 
 
 def _check(options: CheckOptions) -> int:
+    if _of_capture(options):
+        return _check_capture(options)
     if options.reading.kind == "auto":
         detect_kind(options.directory)
     try:
@@ -260,6 +346,14 @@ def _check(options: CheckOptions) -> int:
 
 
 def _convert(options: ConvertOptions) -> int:
+    if options.format in ("folder", "vhap"):
+        capture = open_capture(options.directory, head=options.reading.head or "", scale=options.image_scale)
+        write = write_vhap if options.format == "vhap" else write_capture
+        print(f"wrote {write(capture, options.target, sys.stderr.isatty())}")
+        return 0
+    if detect_capture(options.directory) is not None:
+        raise OptionError(f"{options.directory} is a capture: --format is folder or vhap")
+    assert options.format in ("meshanim", "faceformer")
     dataset = options.reading.open(options.directory)
     done = convert(
         dataset,

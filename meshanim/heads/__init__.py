@@ -9,6 +9,7 @@ from meshanim.heads.head import JOINT_NAMES, JOINT_PARENTS, REGION_NAMES, Head, 
 from meshanim.heads.rig import load_rig, read_rig, rig_head
 from meshanim.heads.rig_data import Rig
 from meshanim.heads.skinning import joint_transforms, linear_blend_skinning
+from meshanim.heads.surface import HeadSurface, RigidPart
 
 __all__ = [
     "JOINT_NAMES",
@@ -19,7 +20,9 @@ __all__ = [
     "Head",
     "HeadParameters",
     "HeadPart",
+    "HeadSurface",
     "Rig",
+    "RigidPart",
     "joint_transforms",
     "linear_blend_skinning",
     "load_flame",

@@ -60,8 +60,17 @@ class FlameHead(Head):
             arrays.pose_directions,
             regressed[..., N_SHAPE:],
         )
+        self.joint_regressor: Tensor
+        self._buffer("joint_regressor", arrays.joint_regressor, (5, len(arrays.vertices)))
         self.masks = dict(masks)
         self._embedding = {name: np.asarray(value) for name, value in embedding.items()}
+
+    def with_offset(self, offset: Float[Tensor, "vertices 3"]) -> "FlameHead":
+        """The same head with a personal template; its joints are regressed from that, as VHAP does."""
+        head = super().with_offset(offset)
+        assert isinstance(head, FlameHead)
+        head.rest_joints = self.rest_joints + self.joint_regressor @ offset.to(self.joint_regressor)
+        return head
 
     def landmarks(
         self,

@@ -1,5 +1,6 @@
 """The one interface of every head: identity, expression, joints and named regions."""
 
+import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 
@@ -211,6 +212,28 @@ class Head(nn.Module):
         if shape is None:
             return self.template_vertices[None]
         return self.template_vertices + self._blend(shape, self.shape_directions, "shape")
+
+    def with_offset(self, offset: Float[Tensor, "vertices 3"]) -> "Head":
+        """The same head with a personal template: what identity coefficients do not hold.
+
+        Parameters
+        ----------
+        offset : (V, 3)
+            Metres, added to the vertices before any joint is turned (VHAP's `static_offset`).
+
+        Raises
+        ------
+        ShapeError
+            If there is not one row a vertex.
+        """
+        if offset.shape != self.template_vertices.shape:
+            raise ShapeError(
+                f"offset must be {tuple(self.template_vertices.shape)}, not {tuple(offset.shape)}"
+            )
+        head = copy.deepcopy(self)
+        head.template_vertices = self.template_vertices + offset.to(self.template_vertices)
+        head.mesh = self.mesh.with_vertices(head.template_vertices.double().cpu().numpy())
+        return head
 
     def joints(
         self,

@@ -11,7 +11,7 @@ from meshanim.render.camera import Camera, orthographic_camera
 from meshanim.render.lighting import Lighting, Quality
 from meshanim.render.rasterizer import native_available, native_view
 
-__all__ = ["Canvas", "Geometry", "paint", "require_native"]
+__all__ = ["Canvas", "Geometry", "paint", "require_native", "strand_cover"]
 
 WIDE_SHARE = 0.4
 SCATTER_METRES = np.array([[0.0019, 0.0008, 0.0005], [0.0006, 0.0003, 0.0002]])
@@ -226,6 +226,27 @@ def paint(
     image = np.empty((camera.height, camera.width, 3), np.uint8)
     _native.develop(canvas.planes, background, image, threads)
     return image
+
+
+def strand_cover(
+    canvas: Canvas,
+    geometry: Geometry,
+    camera: Camera,
+    lighting: Lighting,
+    quality: Quality,
+    strands: Sequence,
+    threads: int = 2,
+) -> Float[np.ndarray, "height width"]:
+    """How much of each pixel of the picture last painted on `canvas` some strands cover, in [0, 1]."""
+    from meshanim import _native
+
+    view, lamp = native_view(camera), lighting.native()
+    planes = np.zeros_like(canvas.planes)
+    for group in strands:
+        _native.draw_strands(
+            geometry.native, group, view, lamp, view, None, canvas.depth, quality.samples, planes, threads
+        )
+    return np.clip(planes[10], 0, 1)
 
 
 def _distance(depth: np.ndarray) -> float:

@@ -7,7 +7,17 @@ from jaxtyping import Float
 
 from meshanim.errors import OptionError
 
-__all__ = ["DRAFT", "FULL", "STUDIO", "Light", "Lighting", "Quality", "backdrop", "quality_named"]
+__all__ = [
+    "DRAFT",
+    "FULL",
+    "STUDIO",
+    "Light",
+    "Lighting",
+    "Quality",
+    "backdrop",
+    "plain_background",
+    "quality_named",
+]
 
 Triple = tuple[float, float, float]
 
@@ -168,6 +178,14 @@ def quality_named(quality: "str | Quality") -> Quality:
     if quality not in named:
         raise OptionError(f"quality must be draft or full, not '{quality}'")
     return named[quality]
+
+
+def plain_background(width: int, height: int, color: Triple) -> Float[np.ndarray, "height width 3"]:
+    """Linear light that the tone curve of `develop` turns into one sRGB colour, in [0, 1]."""
+    wanted = np.array(color, np.float64) ** 2.2
+    light = np.linspace(0, 16, 1 << 20)
+    light = np.interp(wanted, light * (1 + light / 9) / (1 + 0.62 * light) * 1.22, light)
+    return np.broadcast_to(light.astype(np.float32), (height, width, 3)).copy()
 
 
 def backdrop(

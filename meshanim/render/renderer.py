@@ -8,13 +8,13 @@ from jaxtyping import Bool, Float, Int, UInt8
 from meshanim.errors import OptionError, ShapeError
 from meshanim.heads import DefaultHead
 from meshanim.render.camera import Camera, portrait_camera
-from meshanim.render.frame import Canvas, paint, require_native
+from meshanim.render.frame import Canvas, paint, require_native, strand_cover
 from meshanim.render.lighting import STUDIO, Lighting, Quality, backdrop, quality_named
 from meshanim.render.look import Appearance, strand_points
 from meshanim.render.rasterizer import rasterize
-from meshanim.render.scene import PART_NAMES, HeadScene
+from meshanim.render.scene import MOUTH_ISLAND, PART_NAMES, HeadScene
 
-__all__ = ["RenderMaps", "Renderer", "head_camera"]
+__all__ = ["RenderMaps", "Renderer", "head_camera", "head_points"]
 
 
 @dataclass(frozen=True)
@@ -115,6 +115,30 @@ class Renderer:
         twin._canvas = Canvas(self.camera.width, self.camera.height, self.quality)
         return twin
 
+    def seen_from(self, camera: Camera) -> "Renderer":
+        """The same scene and buffers with another camera of the same picture size.
+
+        Textures stay as fine as the first camera needs them.
+
+        Raises
+        ------
+        OptionError
+            If the camera is orthographic.
+        ShapeError
+            If its picture has another size.
+        """
+        if camera.orthographic:
+            raise OptionError("Renderer needs a perspective camera")
+        if (camera.width, camera.height) != (self.camera.width, self.camera.height):
+            raise ShapeError(
+                f"the renderer draws {self.camera.width} x {self.camera.height} pixels, the camera "
+                f"{camera.width} x {camera.height}"
+            )
+        other = object.__new__(Renderer)
+        other.__dict__.update(self.__dict__)
+        other.camera = camera
+        return other
+
     def frame(
         self,
         vertices: Float[np.ndarray, "vertices 3"],
@@ -159,6 +183,37 @@ class Renderer:
         """How much of each pixel of the last frame is head or hair, in [0, 1]."""
         return self._canvas.opacity
 
+    def strand_cover(self, kind: str = "hair") -> Float[np.ndarray, "height width"]:
+        """How much of each pixel of the last frame strands of a kind cover, over skin too, in [0, 1]."""
+        return strand_cover(
+            self._canvas,
+            self._stage.geometry,
+            self.camera,
+            self.lighting,
+            self.quality,
+            self.scene.strands.get(kind, []),
+            self.threads,
+        )
+
+    def frame_regions(self) -> tuple[Int[np.ndarray, "height width"], tuple[str, ...]]:
+        """What most samples of each pixel of the last frame show, hair left out.
+
+        Returns
+        -------
+        region : (H, W) int
+            Index into the names, -1 where nothing is.
+        names : tuple of str
+            As in `RenderMaps`.
+        """
+        labels, names = self._region_labels()
+        labels = np.append(labels, -1)  # a face of -1 is none
+        samples, (height, width) = self.quality.samples, self.background.shape[:2]
+        face = self._canvas.face.reshape(height, samples, width, samples)
+        shown = labels[face].transpose(1, 3, 0, 2).reshape(-1, height, width)
+        votes = (shown[:, None] == shown[None]).sum(1)
+        winner = votes.argmax(0)
+        return np.take_along_axis(shown, winner[None], axis=0)[0], names
+
     def maps(self, vertices: Float[np.ndarray, "vertices 3"]) -> RenderMaps:
         """Mask, depth, normals and regions of the head at pixel centres, without hair and neck fade."""
         self._pose(vertices, None)
@@ -168,11 +223,14 @@ class Renderer:
         )
         normal = buffers.interpolate(geometry.normals, geometry.faces).astype(np.float32)
         normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
-        if self._regions is None:
-            self._regions = _face_regions(self.head, self.scene)
-        labels, names = self._regions
+        labels, names = self._region_labels()
         region = np.where(buffers.mask, labels[np.maximum(buffers.face, 0)], -1).astype(np.int32)
         return RenderMaps(buffers.mask, buffers.depth, normal, region, names)
+
+    def _region_labels(self) -> tuple[np.ndarray, tuple[str, ...]]:
+        if self._regions is None:
+            self._regions = _face_regions(self.head, self.scene)
+        return self._regions
 
     def _pose(self, vertices: np.ndarray, expression: np.ndarray | None) -> None:
         count, names = self.head.mesh.n_vertices, self.head.expression_names
@@ -200,18 +258,23 @@ def head_camera(
     azimuth, elevation : float
         Radians; positive azimuth moves the camera towards +x, positive elevation up.
     """
+    return portrait_camera(head_points(appearance), width, height, azimuth, elevation, margin=0.03)
+
+
+def head_points(appearance: Appearance) -> Float[np.ndarray, "points 3"]:
+    """Points of the resting skin above the fading neck, and the tips of hair and beard, metres."""
     skin = appearance.surface.vertices(appearance.template)
     points = [skin[skin[:, 1] > appearance.neck_fade[:, 1].max() + 0.02]]
     for strands in appearance.strands:
         if strands.kind in ("hair", "beard") and len(strands):
             points.append(strand_points(strands, skin, appearance.surface.faces)[:, -1])
-    return portrait_camera(np.concatenate(points), width, height, azimuth, elevation, margin=0.03)
+    return np.concatenate(points)
 
 
 def _face_regions(head: DefaultHead, scene: HeadScene) -> tuple[np.ndarray, tuple[str, ...]]:
     """Label (F,) of each drawn face and the labels' names: the head's own regions, each vertex in one."""
     order = ("face", "jaw", "upper_face", "scalp", "neck", "nose", "ears", "eyelids", "lips")
-    names = (*order, *PART_NAMES[1:])
+    names = (*order, "mouth_lining", *PART_NAMES[1:])
     of_vertex = np.zeros(head.mesh.n_vertices, np.int64)
     for index, name in enumerate(order):
         of_vertex[head.regions[name]] = index
@@ -223,7 +286,8 @@ def _face_regions(head: DefaultHead, scene: HeadScene) -> tuple[np.ndarray, tupl
         ]
     )
     skin = of_vertex[heaviest][scene.appearance.surface.faces]
-    labels = scene.part.astype(np.int64) + len(order) - 1
+    labels = scene.part.astype(np.int64) + len(order)
     # A face takes the region that most of its corners have.
     labels[: len(skin)] = np.where(skin[:, 1] == skin[:, 2], skin[:, 1], skin[:, 0])
+    labels[: len(skin)][scene.appearance.surface.island == MOUTH_ISLAND] = len(order)
     return labels, names

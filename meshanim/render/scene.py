@@ -16,6 +16,8 @@ from meshanim.render.look.paint import smoothstep
 __all__ = ["PART_NAMES", "HeadScene", "HeadStage"]
 
 PART_NAMES = ("skin", "tongue", "upper_teeth", "lower_teeth", "left_eye", "right_eye")
+MOUTH_ISLAND, NECK_ISLAND = 1, 4
+"""Pieces of the skin's texture layout, the face being 0; 2 and 3 line the eye sockets."""
 SKIN, TONGUE, TEETH, EYES = 0, 1, (2, 3), (4, 5)
 
 MOUTH_LINING = (1.0, 0.065, 0.30, 1.0)
@@ -186,8 +188,8 @@ def _sky(appearance: Appearance) -> np.ndarray:
     surface = appearance.surface
     open_sky = 0.10 + 0.90 * np.clip(1.12 * appearance.sky, 0, 1) ** 1.15
     cavity = np.zeros(len(open_sky), bool)
-    cavity[surface.faces[surface.island == 1]] = True
-    cavity[surface.faces[surface.island != 1]] = False
+    cavity[surface.faces[surface.island == MOUTH_ISLAND]] = True
+    cavity[surface.faces[surface.island != MOUTH_ISLAND]] = False
     return np.where(cavity, 1.0, open_sky).astype(np.float32)
 
 
