@@ -103,6 +103,11 @@ def test_a_character_of_another_topology(talk, head, tmp_path, capsys):
         found = BlendshapeTrack.load(tmp_path / "w.npz")
         jaw = found.weights[:, found.names.index("jawOpen")]
         np.testing.assert_allclose(jaw, np.linspace(0, 0.6, 20)[::4], atol=0.1)
+    words = ("--replay", tmp_path / "back.npz", "--replay-head", f"rig:{out}")
+    assert run("solve", talk[0], "-o", tmp_path / "w.npz", *words) == 0
+    track, replay = BlendshapeTrack.load(tmp_path / "w.npz"), MeshSequence.load(tmp_path / "back.npz")
+    np.testing.assert_allclose(replay.vertices, track.animate(rig).vertices, atol=1e-6)
+    np.testing.assert_array_equal(replay.pose, motion.pose)
 
 
 def test_bad_input_is_one_line_and_exit_2(talk, tmp_path, capsys):
@@ -116,6 +121,7 @@ def test_bad_input_is_one_line_and_exit_2(talk, tmp_path, capsys):
         (("solve", path, "-o", tmp_path / "a.json"), ".csv or .npz"),
         (("solve", path, "--replay", tmp_path / "a.csv"), ".npz"),
         (("solve", path, "-o", tmp_path / "none" / "a.csv"), "cannot write"),
+        (("solve", path, "--replay-head", "default"), "--replay"),
         (("solve", path, "-o", tmp_path / "a.csv", "--active", "grin"), "no shape named grin"),
         (("solve", path, "-o", tmp_path / "a.csv", "--l2", "-1"), "l2 must be"),
         (("solve", path, "-o", tmp_path / "a.csv", "--samples", "0"), "positive"),

@@ -42,6 +42,9 @@ class SolveOptions:
     """Options from the JSON of an Audio2Face-3D rig, instead of the ones below."""
     replay: Path | None = None
     """Also write the motion that the weights make, .npz."""
+    replay_head: str | None = None
+    """Whose motion that is: any head with shapes of these names, such as rig:/path/character.glb that
+    `meshanim data personalize` wrote; the sequence's own face if not given."""
     json: Path | None = None
     """Also write the residuals here."""
     terms: OmitArgPrefixes[SolverOptions] = field(default_factory=SolverOptions)
@@ -54,6 +57,8 @@ def solve(options: SolveOptions) -> None:
             raise OptionError(f"cannot write {path}: the ending must be {' or '.join(endings)}")
         if path is not None:
             check_writable(path)
+    if options.replay_head is not None and options.replay is None:
+        raise OptionError("--replay-head needs --replay, the file to write")
     sequence = MeshSequence.load(options.motion)
     head = head_for(sequence, load_head(options.head), options.method)
     terms = options.terms
@@ -64,7 +69,9 @@ def solve(options: SolveOptions) -> None:
     solved = solve_sequence(sequence, head, terms, options.samples, sys.stderr.isatty())
     solved.track.save(options.output)
     if options.replay is not None:
-        solved.motion.save(options.replay)
+        other = options.replay_head
+        motion = solved.motion if other is None else solved.track.animate(load_head(other))
+        motion.save(options.replay)
     print(solved.residual.table())
     print(f"wrote {options.output}: {len(solved.track)} frames, {len(solved.track.names)} shapes")
     if options.json is not None:

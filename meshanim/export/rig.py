@@ -30,16 +30,11 @@ def write_rig(path: str | Path, rig: Rig) -> None:
     path = Path(path)
     match path.suffix.lower():
         case ".npz":
-            regions = {f"region_{name}": rows for name, rows in rig.regions.items()}
+            arrays = {f"region_{name}": rows for name, rows in rig.regions.items()}
+            arrays |= {"neutral": rig.neutral, "faces": rig.faces, "names": np.array(rig.names)}
+            arrays["deltas"] = rig.deltas.astype(np.float32)
             with written_whole(path) as temporary, open(temporary, "wb") as file:
-                np.savez_compressed(
-                    file,
-                    neutral=rig.neutral,
-                    faces=rig.faces,
-                    names=np.array(rig.names),
-                    deltas=rig.deltas.astype(np.float32),
-                    **regions,
-                )
+                np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
         case ".glb":
             write_morph_targets(path, rig)
         case "":

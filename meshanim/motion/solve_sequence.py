@@ -16,6 +16,7 @@ from meshanim.results import Results
 __all__ = ["SolvedSequence", "head_for", "solve_sequence"]
 
 FRAMES_AT_ONCE = 256
+USED = 0.01
 REPORTED = ("face", "lips", "eyelids", "jaw")
 
 
@@ -26,7 +27,8 @@ class SolvedSequence:
     track: BlendshapeTrack
     motion: MeshSequence
     residual: Results
-    """Root mean square and largest distance in mm by region, beside the size of the motion."""
+    """Root mean square and largest distance in mm by region, beside the size of the motion, and how many
+    shapes are at work."""
 
 
 def head_for(sequence: MeshSequence, head: Head, method: Method = "deformation_transfer") -> Head:
@@ -66,7 +68,11 @@ def solve_sequence(
     track = BlendshapeTrack(solver.names, weights, sequence.fps, sequence.pose)
     made = solver.reconstruct(weights).astype(np.float32)
     motion = MeshSequence(made, sequence.fps, sequence.mesh, sequence.pose, sequence.audio)
-    return SolvedSequence(track, motion, _residual(sequence, made, head, solver))
+    residual = _residual(sequence, made, head, solver)
+    if len(weights):
+        used = float((np.abs(weights) > USED).sum(1).mean())
+        residual.add("weights", "blendshapes", f"shapes above {USED} a frame", used, "count")
+    return SolvedSequence(track, motion, residual)
 
 
 def _residual(

@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt8
 from meshanim.errors import OptionError, ShapeError
 from meshanim.heads import DefaultHead
 from meshanim.motion import MeshSequence
-from meshanim.motion.blendshape_weights import BlendshapeWeights
+from meshanim.motion.blendshape_solver import BlendshapeSolver
 from meshanim.render.camera import Camera
 from meshanim.render.lighting import Quality
 from meshanim.render.look import Appearance
@@ -51,7 +51,7 @@ def render_sequence(
     camera : Camera, optional
         Frames the resting head, if not given; it stands still.
     expression : (T, E) float, optional
-        Weights that drive the wrinkles; found from the vertices by least squares if not given.
+        Weights that drive the wrinkles; found from the vertices if not given.
     wrinkles : bool
         False draws resting wrinkles only.
     workers : int
@@ -85,8 +85,7 @@ def _draw(sequence, head, first: Renderer, expression, wrinkles: bool, workers: 
     appearance = first.scene.appearance
     solve = None
     if wrinkles and expression is None:
-        directions = head.expression_directions.detach().unflatten(1, (-1, 3)).numpy()
-        solve = BlendshapeWeights(directions)
+        solve = BlendshapeSolver.from_head(head, neutral=appearance.template)
     shape = torch.from_numpy(appearance.shape)[None]
     waiting: deque[Future] = deque()
     with ThreadPoolExecutor(workers) as pool:
@@ -97,7 +96,7 @@ def _draw(sequence, head, first: Renderer, expression, wrinkles: bool, workers: 
                 if expression is not None:
                     weights = np.ascontiguousarray(expression[start : start + BATCH], np.float32)
                 elif solve is not None:
-                    weights = solve(vertices - appearance.template)
+                    weights = solve(vertices).astype(np.float32)
                 posed = _posed(head, vertices, sequence.pose[start : start + BATCH], shape)
                 for index in range(len(vertices)):
                     # A renderer is free once the frame that it drew `workers` frames ago has been taken.

@@ -5,7 +5,6 @@ import torch
 from meshanim.errors import OptionError, ShapeError
 from meshanim.heads import load_head
 from meshanim.motion import MeshSequence
-from meshanim.motion.blendshape_weights import BlendshapeWeights
 from meshanim.render import (
     DRAFT,
     FULL,
@@ -215,22 +214,6 @@ def test_sequence_equals_frames(head, appearance, full):
     half = render_sequence(sequence, head, appearance, SIZE, SIZE)
     next(half)
     half.close()  # stopping early leaves no thread behind
-
-
-def test_weights_from_vertices(head):
-    directions = head.expression_directions.unflatten(1, (-1, 3)).numpy()
-    solve = BlendshapeWeights(directions)
-    for name in ("jawOpen", "browInnerUp", "mouthSmileLeft"):
-        weights = np.zeros(len(head.expression_names), np.float32)
-        weights[head.expression_names.index(name)] = 0.8
-        found = solve(np.tensordot(weights, directions, 1))
-        assert found.argmax() == weights.argmax()
-        assert abs(found.max() - 0.8) < 0.25
-    assert (solve(np.zeros((2, *directions.shape[1:]), np.float32)) == 0).all()
-    with pytest.raises(ShapeError, match="displacements"):
-        solve(np.zeros((4, 3), np.float32))
-    with pytest.raises(OptionError, match="ridge"):
-        BlendshapeWeights(directions, ridge=0.0)
 
 
 def test_bad_input_is_named(head, appearance, full):
