@@ -9,7 +9,9 @@ from torch import Tensor
 from meshanim.errors import BackendError, OptionError, ShapeError
 from meshanim.gaussians.cameras import Cameras
 from meshanim.gaussians.gaussians import Gaussians
+from meshanim.gaussians.splat import native
 from meshanim.gaussians.splat.cuda import rasterize_cuda
+from meshanim.gaussians.splat.native import rasterize_native
 from meshanim.gaussians.splat.reference import rasterize_reference
 from meshanim.gaussians.splat.rendering import DepthMode, RasterOptions, Rendering
 
@@ -96,7 +98,7 @@ def rasterize(
     offsets = None
     if screen_gradients:
         offsets = gaussians.means.new_zeros((*images, len(gaussians), 2)).requires_grad_()
-    render = {"cuda": rasterize_cuda, "reference": rasterize_reference}[backend]
+    render = {"native": rasterize_native, "cuda": rasterize_cuda, "reference": rasterize_reference}[backend]
     return render(gaussians, cameras, behind, options, offsets)
 
 
@@ -104,19 +106,21 @@ def _choose(backend: str, gaussians: Gaussians) -> str:
     if backend not in BACKENDS:
         raise OptionError(f"backend {backend!r} is not one of {', '.join(BACKENDS)}")
     device, dtype = gaussians.means.device, gaussians.means.dtype
+    fits_native = device.type == "cpu" and dtype == torch.float32
     fits_cuda = device.type == "cuda" and dtype == torch.float32
     if backend == "auto":
         if fits_cuda:
             return "cuda"
-        return "reference"
-    if backend == "native":
+        return "native" if fits_native and native.available() else "reference"
+    if backend == "native" and not native.available():
         raise BackendError(
             "backend 'native' is not built: install meshanim with a C++17 compiler at hand, "
             "or use backend='reference'"
         )
-    if backend == "cuda" and not fits_cuda:
+    if (backend == "native" and not fits_native) or (backend == "cuda" and not fits_cuda):
+        place = "the CPU" if backend == "native" else "an NVIDIA GPU"
         raise BackendError(
-            f"backend {backend!r} computes float32 on an NVIDIA GPU, not {dtype} on {device}: "
+            f"backend {backend!r} computes float32 on {place}, not {dtype} on {device}: "
             "use backend='reference' or 'auto'"
         )
     return backend

@@ -35,6 +35,7 @@ void bind_image(nb::module_ &);
 void bind_memory(nb::module_ &);
 void bind_noise(nb::module_ &);
 void bind_raster(nb::module_ &);
+void bind_splat(nb::module_ &);
 
 NB_MODULE(_native, m) {
     m.doc() = "Compiled kernels of meshanim.";
@@ -55,4 +56,5 @@ NB_MODULE(_native, m) {
     bind_memory(m);
     bind_noise(m);
     bind_raster(m);
+    bind_splat(m);
 }

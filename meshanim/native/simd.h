@@ -66,6 +66,65 @@ inline Floats sums(const Floats (&rows)[LANES]) {
     return _mm512_shuffle_f32x4(low, high, 0x88) + _mm512_shuffle_f32x4(low, high, 0xdd);
 }
 
+using Mask = __mmask16;
+
+inline Floats floor(Floats a) { return _mm512_roundscale_ps(a, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC); }
+inline Mask greater(Floats a, Floats b) { return _mm512_cmp_ps_mask(a, b, _CMP_GT_OQ); }   // false on NaN
+inline Mask at_least(Floats a, Floats b) { return _mm512_cmp_ps_mask(a, b, _CMP_GE_OQ); }  // false on NaN
+inline Mask both(Mask a, Mask b) { return a & b; }
+inline Mask without(Mask a, Mask b) { return Mask(a & ~b); }
+inline bool any(Mask a) { return a != 0; }
+inline uint32_t bits(Mask a) { return a; }
+inline Floats select(Mask where, Floats a, Floats b) { return _mm512_mask_blend_ps(where, b, a); }
+inline Floats keep(Mask where, Floats a) { return _mm512_maskz_mov_ps(where, a); }  // zeros elsewhere
+// Four floats, repeated.
+inline Floats load_quad(const float *p) { return _mm512_broadcast_f32x4(_mm_loadu_ps(p)); }
+// Lane i is a[lanes[i]].
+inline Floats lookup(Floats a, const int32_t *lanes) {
+    return _mm512_permutexvar_ps(_mm512_loadu_si512(lanes), a);
+}
+inline void store_rounded(int32_t *p, Floats a) { _mm512_storeu_si512(p, _mm512_cvtps_epi32(a)); }
+// a positive and normal = 2^exponent times the result, which lies in [sqrt(1/2), sqrt(2)).
+inline Floats split(Floats a, Floats &exponent) {
+    const __m512i bits = _mm512_castps_si512(a), root = _mm512_set1_epi32(0x3f3504f3);
+    const __m512i n = _mm512_srai_epi32(_mm512_sub_epi32(bits, root), 23);
+    exponent = _mm512_cvtepi32_ps(n);
+    return _mm512_castsi512_ps(_mm512_sub_epi32(bits, _mm512_slli_epi32(n, 23)));
+}
+// 2^x for x in [-126, 127] within 2 ulp; minimax polynomial on [0, 1) (error 8e-8).
+inline Floats exp2(Floats x) {
+    const Floats r = _mm512_reduce_ps(x, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC);
+    Floats p = broadcast(1.877576671e-03f);
+    p = fma(p, r, broadcast(8.989340101e-03f));
+    p = fma(p, r, broadcast(5.582631804e-02f));
+    p = fma(p, r, broadcast(2.401536170e-01f));
+    p = fma(p, r, broadcast(6.931530732e-01f));
+    p = fma(p, r, broadcast(9.999999251e-01f));
+    return _mm512_scalef_ps(p, x);
+}
+
+// Lane i of row j becomes lane j of row i.
+inline void transpose(Floats (&rows)[LANES]) {
+    Floats quads[16];
+    for (int i = 0; i < 4; ++i) {
+        const Floats *r = rows + 4 * i;
+        const __m512d a = _mm512_castps_pd(_mm512_unpacklo_ps(r[0], r[1])), b = _mm512_castps_pd(_mm512_unpackhi_ps(r[0], r[1]));
+        const __m512d c = _mm512_castps_pd(_mm512_unpacklo_ps(r[2], r[3])), d = _mm512_castps_pd(_mm512_unpackhi_ps(r[2], r[3]));
+        quads[4 * i] = _mm512_castpd_ps(_mm512_unpacklo_pd(a, c));
+        quads[4 * i + 1] = _mm512_castpd_ps(_mm512_unpackhi_pd(a, c));
+        quads[4 * i + 2] = _mm512_castpd_ps(_mm512_unpacklo_pd(b, d));
+        quads[4 * i + 3] = _mm512_castpd_ps(_mm512_unpackhi_pd(b, d));
+    }
+    for (int i = 0; i < 4; ++i) {
+        const Floats a = _mm512_shuffle_f32x4(quads[i], quads[4 + i], 0x44), b = _mm512_shuffle_f32x4(quads[i], quads[4 + i], 0xee);
+        const Floats c = _mm512_shuffle_f32x4(quads[8 + i], quads[12 + i], 0x44), d = _mm512_shuffle_f32x4(quads[8 + i], quads[12 + i], 0xee);
+        rows[i] = _mm512_shuffle_f32x4(a, c, 0x88);
+        rows[4 + i] = _mm512_shuffle_f32x4(a, c, 0xdd);
+        rows[8 + i] = _mm512_shuffle_f32x4(b, d, 0x88);
+        rows[12 + i] = _mm512_shuffle_f32x4(b, d, 0xdd);
+    }
+}
+
 #elif defined(__AVX2__)
 
 constexpr int LANES = 8;
@@ -108,6 +167,60 @@ inline Floats sums(const Floats (&rows)[LANES]) {
         quads[i] = _mm256_castpd_ps(_mm256_unpacklo_pd(x, y)) + _mm256_castpd_ps(_mm256_unpackhi_pd(x, y));
     }
     return _mm256_permute2f128_ps(quads[0], quads[1], 0x20) + _mm256_permute2f128_ps(quads[0], quads[1], 0x31);
+}
+
+using Mask = __m256;
+
+inline Floats floor(Floats a) { return _mm256_round_ps(a, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC); }
+inline Mask greater(Floats a, Floats b) { return _mm256_cmp_ps(a, b, _CMP_GT_OQ); }
+inline Mask at_least(Floats a, Floats b) { return _mm256_cmp_ps(a, b, _CMP_GE_OQ); }
+inline Mask both(Mask a, Mask b) { return _mm256_and_ps(a, b); }
+inline Mask without(Mask a, Mask b) { return _mm256_andnot_ps(b, a); }
+inline uint32_t bits(Mask a) { return uint32_t(_mm256_movemask_ps(a)); }
+inline bool any(Mask a) { return bits(a) != 0; }
+inline Floats select(Mask where, Floats a, Floats b) { return _mm256_blendv_ps(b, a, where); }
+inline Floats keep(Mask where, Floats a) { return _mm256_and_ps(where, a); }
+inline Floats load_quad(const float *p) { return _mm256_broadcast_ps(reinterpret_cast<const __m128 *>(p)); }
+inline Floats lookup(Floats a, const int32_t *lanes) {
+    return _mm256_permutevar8x32_ps(a, _mm256_loadu_si256(reinterpret_cast<const __m256i *>(lanes)));
+}
+inline void store_rounded(int32_t *p, Floats a) {
+    _mm256_storeu_si256(reinterpret_cast<__m256i *>(p), _mm256_cvtps_epi32(a));
+}
+inline Floats split(Floats a, Floats &exponent) {
+    const __m256i bits = _mm256_castps_si256(a), root = _mm256_set1_epi32(0x3f3504f3);
+    const __m256i n = _mm256_srai_epi32(_mm256_sub_epi32(bits, root), 23);
+    exponent = _mm256_cvtepi32_ps(n);
+    return _mm256_castsi256_ps(_mm256_sub_epi32(bits, _mm256_slli_epi32(n, 23)));
+}
+inline Floats exp2(Floats x) {
+    x = maximum(broadcast(-126.0f), x);
+    const Floats n = floor(x), r = x - n;
+    Floats p = broadcast(1.877576671e-03f);
+    p = fma(p, r, broadcast(8.989340101e-03f));
+    p = fma(p, r, broadcast(5.582631804e-02f));
+    p = fma(p, r, broadcast(2.401536170e-01f));
+    p = fma(p, r, broadcast(6.931530732e-01f));
+    p = fma(p, r, broadcast(9.999999251e-01f));
+    return _mm256_castsi256_ps(
+        _mm256_add_epi32(_mm256_castps_si256(p), _mm256_slli_epi32(_mm256_cvtps_epi32(n), 23)));
+}
+
+inline void transpose(Floats (&rows)[LANES]) {
+    Floats quads[8];
+    for (int i = 0; i < 2; ++i) {
+        const Floats *r = rows + 4 * i;
+        const __m256d a = _mm256_castps_pd(_mm256_unpacklo_ps(r[0], r[1])), b = _mm256_castps_pd(_mm256_unpackhi_ps(r[0], r[1]));
+        const __m256d c = _mm256_castps_pd(_mm256_unpacklo_ps(r[2], r[3])), d = _mm256_castps_pd(_mm256_unpackhi_ps(r[2], r[3]));
+        quads[4 * i] = _mm256_castpd_ps(_mm256_unpacklo_pd(a, c));
+        quads[4 * i + 1] = _mm256_castpd_ps(_mm256_unpackhi_pd(a, c));
+        quads[4 * i + 2] = _mm256_castpd_ps(_mm256_unpacklo_pd(b, d));
+        quads[4 * i + 3] = _mm256_castpd_ps(_mm256_unpackhi_pd(b, d));
+    }
+    for (int i = 0; i < 4; ++i) {
+        rows[i] = _mm256_permute2f128_ps(quads[i], quads[4 + i], 0x20);
+        rows[4 + i] = _mm256_permute2f128_ps(quads[i], quads[4 + i], 0x31);
+    }
 }
 
 #else
@@ -164,6 +277,60 @@ inline Floats sums(const Floats (&rows)[LANES]) {
     });
 }
 
+struct Mask {
+    bool lane[LANES];
+};
+
+template <class Function>
+inline Mask where(Function function) {
+    Mask result;
+    for (int i = 0; i < LANES; ++i) result.lane[i] = function(i);
+    return result;
+}
+inline Floats operator-(Floats a) { return each([&](int i) { return -a.lane[i]; }); }
+inline Floats &operator-=(Floats &a, Floats b) { return a = a - b; }
+inline Floats floor(Floats a) { return each([&](int i) { return std::floor(a.lane[i]); }); }
+inline Mask greater(Floats a, Floats b) { return where([&](int i) { return a.lane[i] > b.lane[i]; }); }
+inline Mask at_least(Floats a, Floats b) { return where([&](int i) { return a.lane[i] >= b.lane[i]; }); }
+inline Mask both(Mask a, Mask b) { return where([&](int i) { return a.lane[i] && b.lane[i]; }); }
+inline Mask without(Mask a, Mask b) { return where([&](int i) { return a.lane[i] && !b.lane[i]; }); }
+inline uint32_t bits(Mask a) { return a.lane[0] | a.lane[1] << 1 | a.lane[2] << 2 | a.lane[3] << 3; }
+inline bool any(Mask a) { return bits(a) != 0; }
+inline Floats select(Mask m, Floats a, Floats b) {
+    return each([&](int i) { return m.lane[i] ? a.lane[i] : b.lane[i]; });
+}
+inline Floats keep(Mask m, Floats a) { return each([&](int i) { return m.lane[i] ? a.lane[i] : 0.0f; }); }
+inline Floats load_quad(const float *p) { return load(p); }
+inline Floats lookup(Floats a, const int32_t *lanes) { return each([&](int i) { return a.lane[lanes[i]]; }); }
+inline void store_rounded(int32_t *p, Floats a) {
+    for (int i = 0; i < LANES; ++i) p[i] = int32_t(std::nearbyint(a.lane[i]));
+}
+inline Floats split(Floats a, Floats &exponent) {
+    return each([&](int i) {
+        int n;
+        float m = std::frexp(a.lane[i], &n);
+        if (m < 0.70710678f) m *= 2, --n;
+        exponent.lane[i] = float(n);
+        return m;
+    });
+}
+inline Floats exp2(Floats x) {
+    x = maximum(broadcast(-126.0f), x);
+    const Floats n = floor(x), r = x - n;
+    Floats p = broadcast(1.877576671e-03f);
+    p = fma(p, r, broadcast(8.989340101e-03f));
+    p = fma(p, r, broadcast(5.582631804e-02f));
+    p = fma(p, r, broadcast(2.401536170e-01f));
+    p = fma(p, r, broadcast(6.931530732e-01f));
+    p = fma(p, r, broadcast(9.999999251e-01f));
+    return each([&](int i) { return p.lane[i] * power_of_two(int(n.lane[i])); });
+}
+
+inline void transpose(Floats (&rows)[LANES]) {
+    for (int i = 0; i < LANES; ++i)
+        for (int j = 0; j < i; ++j) std::swap(rows[i].lane[j], rows[j].lane[i]);
+}
+
 #endif
 
 inline Floats zeros() { return broadcast(0.0f); }
@@ -176,6 +343,11 @@ inline Floats fold_sum(Floats a, int period) {
 inline Floats fold_maximum(Floats a, int period) {
     for (int distance = LANES / 2; distance >= period; distance /= 2) a = maximum(a, rotate(a, distance));
     return a;
+}
+// Sums of the quads: lane i of out[j] is the sum of lanes 4 j to 4 j + 3 of rows[i].
+inline void quad_sums(Floats (&rows)[LANES], Floats (&out)[LANES / 4]) {
+    transpose(rows);
+    for (int j = 0; j < LANES / 4; ++j) out[j] = (rows[4 * j] + rows[4 * j + 1]) + (rows[4 * j + 2] + rows[4 * j + 3]);
 }
 inline float sum(Floats a) {
     float lanes[LANES];
@@ -198,6 +370,22 @@ inline Floats exp(Floats x) {
     p = fma(p, r, broadcast(1.0f));
     p = fma(p, r, broadcast(1.0f));
     return scale_by_power(p, n);
+}
+
+// log2 of positive normal numbers within 2 ulp.
+inline Floats log2(Floats x) {
+    Floats n;
+    const Floats t = split(x, n) - broadcast(1.0f);
+    Floats p = broadcast(1.258374164e-01f);
+    p = fma(p, t, broadcast(-2.072704205e-01f));
+    p = fma(p, t, broadcast(2.157157655e-01f));
+    p = fma(p, t, broadcast(-2.389447421e-01f));
+    p = fma(p, t, broadcast(2.879162258e-01f));
+    p = fma(p, t, broadcast(-3.607036854e-01f));
+    p = fma(p, t, broadcast(4.809106436e-01f));
+    p = fma(p, t, broadcast(-7.213473468e-01f));
+    p = fma(p, t, broadcast(1.442695004e+00f));
+    return fma(p, t, n);
 }
 
 }  // namespace simd

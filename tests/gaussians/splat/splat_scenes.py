@@ -18,7 +18,7 @@ def cameras(width, height, count=1, seed=0, dtype=torch.float32):
         pose[:3, :3] = rotation * torch.sign(torch.linalg.det(rotation))
         pose[:3, 3] = torch.tensor([0.0, 0.0, 4.0]) + 0.1 * torch.randn(3, generator=generator)
         poses.append(pose)
-    focal = 1.1 * max(width, height)
+    focal = 1.1 * max(width, height, 16)
     k = torch.tensor([[focal, 0, 0.55 * width], [0, 0.9 * focal, 0.47 * height], [0, 0, 1]])
     return Cameras(torch.stack(poses).to(dtype), k.expand(count, 3, 3).to(dtype), width, height)
 
@@ -65,7 +65,8 @@ def leaves(gaussians, dtype=None):
 
 def relative(value, truth):
     """Relative L2 distance."""
-    return float((value.double() - truth.double()).norm() / truth.double().norm().clamp_min(1e-300))
+    value, truth = value.detach().double(), truth.detach().double()
+    return float((value - truth).norm() / truth.norm().clamp_min(1e-300))
 
 
 def brute_force(gaussians, cameras, background, antialiased=False, eps2d=0.3, max_alpha=0.999):

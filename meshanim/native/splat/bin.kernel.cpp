@@ -1,0 +1,121 @@
+// Binning: visible items by depth (radix sort), then stably into tiles (counting sort). One order for any number of
+// threads: a thread takes a range of what is to be sorted and knows how many of each kind the ranges before it hold.
+#include <cstring>
+
+#include "isa.h"
+#include "splat.h"
+
+namespace MESHANIM_NAMESPACE {
+namespace {
+
+using splat::Entry;
+using splat::Key;
+using splat::Rectangle;
+using splat::Scene;
+
+constexpr int DIGIT = 11, DIGITS = 1 << DIGIT;
+
+struct Range {
+    int64_t begin, end;
+    Range(int64_t count, int part, int parts) : begin(count * part / parts), end(count * (part + 1) / parts) {}
+};
+
+// counts[part][kind] to where each part puts its first of each kind; ends with the total.
+int64_t prefix(int32_t *counts, int64_t kinds, int parts, int32_t *starts) {
+    int64_t total = 0;
+    for (int64_t kind = 0; kind < kinds; ++kind) {
+        if (starts) starts[kind] = int32_t(total);
+        for (int part = 0; part < parts; ++part) {
+            const int32_t count = counts[part * kinds + kind];
+            counts[part * kinds + kind] = int32_t(total);
+            total += count;
+        }
+    }
+    if (starts) starts[kinds] = int32_t(total);
+    return total;
+}
+
+}  // namespace
+
+// Key the visible items in their order, and give every item its slots. The chunks' counts become their beginnings.
+void splat_collect(const Scene &scene, const splat::Projected &projected, Key *keys, int32_t *slots) {
+    const int64_t chunks = scene.chunks(), tasks = scene.images() * chunks;
+#pragma omp parallel for num_threads(scene.threads) schedule(static)
+    for (int64_t task = 0; task < tasks; ++task) {
+        const int64_t begin = task / chunks * scene.gaussians + task % chunks * splat::CHUNK;
+        const int64_t rest = scene.gaussians - task % chunks * splat::CHUNK;
+        const int64_t end = begin + (rest < splat::CHUNK ? rest : splat::CHUNK);
+        int64_t key = projected.chunk_items[task];
+        int32_t slot = int32_t(projected.chunk_entries[task]);
+        for (int64_t item = begin; item < end; ++item) {
+            slots[item] = slot;
+            slot += projected.rectangles[item].count();
+            if (projected.depths[item]) keys[key++] = {projected.depths[item], uint32_t(item)};
+        }
+    }
+}
+
+// Sorts by depth, stably; `other` is as long as `keys`. Returns where the result is. counts: threads * DIGITS.
+Key *splat_sort(const Scene &scene, Key *keys, Key *other, int64_t count, int32_t *counts) {
+    const int parts = int(count / 4096 + 1 < scene.threads ? count / 4096 + 1 : scene.threads);
+    uint32_t least = 0xffffffffu, most = 0;
+    for (int64_t i = 0; i < count; ++i) {
+        least = keys[i].depth < least ? keys[i].depth : least;
+        most = keys[i].depth > most ? keys[i].depth : most;
+    }
+    for (int shift = 0; count && shift < 32 && ((most - least) >> shift) != 0; shift += DIGIT) {
+        std::memset(counts, 0, sizeof(int32_t) * size_t(parts) * DIGITS);
+#pragma omp parallel for num_threads(parts) schedule(static, 1)
+        for (int part = 0; part < parts; ++part) {
+            const Range range(count, part, parts);
+            for (int64_t i = range.begin; i < range.end; ++i)
+                ++counts[part * DIGITS + (((keys[i].depth - least) >> shift) & (DIGITS - 1))];
+        }
+        prefix(counts, DIGITS, parts, nullptr);
+#pragma omp parallel for num_threads(parts) schedule(static, 1)
+        for (int part = 0; part < parts; ++part) {
+            const Range range(count, part, parts);
+            for (int64_t i = range.begin; i < range.end; ++i)
+                other[counts[part * DIGITS + (((keys[i].depth - least) >> shift) & (DIGITS - 1))]++] = keys[i];
+        }
+        Key *const swapped = keys;
+        keys = other;
+        other = swapped;
+    }
+    return keys;
+}
+
+// counts: threads * tiles.
+void splat_fill(const Scene &scene, const Key *keys, int64_t count, const Rectangle *rectangles, int32_t *counts,
+                const splat::Bins &out) {
+    const int parts = int(count / 4096 + 1 < scene.threads ? count / 4096 + 1 : scene.threads);
+    const int64_t tiles = scene.tiles(), columns = scene.columns(), of_image = columns * scene.rows();
+    std::memset(counts, 0, sizeof(int32_t) * size_t(parts * tiles));
+#pragma omp parallel for num_threads(parts) schedule(static, 1)
+    for (int part = 0; part < parts; ++part) {
+        const Range range(count, part, parts);
+        int32_t *const of_part = counts + part * tiles;
+        for (int64_t i = range.begin; i < range.end; ++i) {
+            const Rectangle box = rectangles[keys[i].item];
+            int32_t *const of_tile = of_part + keys[i].item / scene.gaussians * of_image;
+            for (int y = box.y0; y < box.y1; ++y)
+                for (int x = box.x0; x < box.x1; ++x) ++of_tile[y * columns + x];
+        }
+    }
+    prefix(counts, tiles, parts, out.tiles);
+#pragma omp parallel for num_threads(parts) schedule(static, 1)
+    for (int part = 0; part < parts; ++part) {
+        const Range range(count, part, parts);
+        int32_t *const of_part = counts + part * tiles;
+        for (int64_t i = range.begin; i < range.end; ++i) {
+            const uint32_t item = keys[i].item;
+            const Rectangle box = rectangles[item];
+            int32_t *const of_tile = of_part + item / scene.gaussians * of_image;
+            uint32_t slot = uint32_t(out.slots[item]);
+            for (int y = box.y0; y < box.y1; ++y)
+                for (int x = box.x0; x < box.x1; ++x) out.entries[of_tile[y * columns + x]++] = {item, slot++};
+        }
+    }
+}
+
+}  // namespace MESHANIM_NAMESPACE

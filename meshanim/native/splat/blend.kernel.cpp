@@ -1,0 +1,131 @@
+// Blending: each tile's entries from near to far. A block of pixels keeps its light and colours in registers while
+// its own list of entries passes.
+#include <cstring>
+
+#include "isa.h"
+#include "splat.h"
+#include "tile.h"
+
+namespace MESHANIM_NAMESPACE {
+namespace {
+
+using splat::Forward;
+using splat::Scene;
+
+constexpr int BATCH = 128;   // entries that are listed at once
+
+// What has been blended into a block so far.
+template <int CHANNELS>
+struct State {
+    Floats light[BLOCKS], color[CHANNELS][BLOCKS];
+    Mask open[BLOCKS];   // pixels that still take something
+};
+
+template <int CHANNELS>
+void blend_block(const Block &block, int index, const float *local, const int32_t *list, int count, float max_alpha,
+                 State<CHANNELS> &state) {
+    const Floats u = block.u, v = block.v, least = broadcast(splat::LOG2_MIN_ALPHA), most = broadcast(max_alpha), end = broadcast(splat::MIN_LIGHT);
+    Floats light = state.light[index], color[CHANNELS];
+    for (int j = 0; j < CHANNELS; ++j) color[j] = state.color[j][index];
+    Mask open = state.open[index];
+    for (int i = 0; i < count; ++i) {
+        const float *e = local + list[i];
+        const Floats p = fma(broadcast(e[splat::A]), u, fma(broadcast(e[splat::B]), v, broadcast(e[P])));
+        const Floats q = fma(broadcast(e[splat::C]), v, broadcast(e[Q]));
+        const Floats level = broadcast(e[splat::LEVEL]) - q * q - p * p;
+        const Mask counts = simd::both(open, simd::at_least(level, least));
+        const Floats alpha = simd::minimum(simd::exp2(level), most), left = light - light * alpha;
+        const Mask taken = simd::both(counts, simd::greater(left, end));
+        open = simd::without(open, simd::without(counts, taken));
+        const Floats weight = simd::keep(taken, alpha * light);
+        for (int j = 0; j < CHANNELS; ++j) color[j] = fma(weight, broadcast(e[splat::COLOR + j]), color[j]);
+        light = simd::select(taken, left, light);
+    }
+    state.light[index] = light;
+    for (int j = 0; j < CHANNELS; ++j) state.color[j][index] = color[j];
+    state.open[index] = open;
+}
+
+template <int CHANNELS>
+void write_tile(const Scene &scene, const Tile &tile, int group, const State<CHANNELS> &state, float *planes) {
+    const int64_t area = int64_t(scene.width) * scene.height;
+    float *const image = planes + tile.image * (scene.blended() + 1) * area;
+    const float *background = scene.background + tile.image * scene.channels;
+    for (int b = 0; b < BLOCKS; ++b) {
+        const Block &block = block_at(b);
+        const int rows = tile.height - block.row < BLOCK_HEIGHT ? tile.height - block.row : BLOCK_HEIGHT;
+        const int columns = tile.width - block.column < BLOCK_WIDTH ? tile.width - block.column : BLOCK_WIDTH;
+        if (rows <= 0 || columns <= 0) continue;
+        const int64_t corner = int64_t(tile.y + block.row) * scene.width + tile.x + block.column;
+        auto write = [&](Floats value, int64_t plane) {
+            float lanes[LANES];
+            simd::store(lanes, value);
+            float *out = image + plane * area + corner;
+            for (int row = 0; row < rows; ++row, out += scene.width) {
+                if (columns == BLOCK_WIDTH) std::memcpy(out, lanes + row * BLOCK_WIDTH, BLOCK_WIDTH * sizeof(float));
+                else std::memcpy(out, lanes + row * BLOCK_WIDTH, size_t(columns) * sizeof(float));
+            }
+        };
+        for (int j = 0; j < CHANNELS; ++j) {
+            const int64_t channel = int64_t(group) * splat::GROUP + j;
+            const float behind = channel < scene.channels ? background[channel] : 0.0f;
+            write(fma(state.light[b], broadcast(behind), state.color[j][b]), channel);
+        }
+        if (group == 0) write(broadcast(1.0f) - state.light[b], scene.blended());
+    }
+}
+
+template <int CHANNELS>
+void blend_tile(const Scene &scene, const Forward &out, int64_t index, int group) {
+    const Tile tile(scene, index);
+    const int64_t begin = out.bins.tiles[index], end = out.bins.tiles[index + 1];
+    State<CHANNELS> state;
+    bool open[BLOCKS];
+    for (int b = 0; b < BLOCKS; ++b) {
+        state.light[b] = broadcast(1.0f);
+        for (int j = 0; j < CHANNELS; ++j) state.color[j][b] = broadcast(0.0f);
+        if (begin == end) continue;
+        state.open[b] = block_at(b).inside(tile);
+        open[b] = simd::any(state.open[b]);
+    }
+    alignas(64) float local[BATCH * RECORD];
+    int32_t lists[BLOCKS * (BATCH + LANES)], counts[BLOCKS];
+    int64_t first = begin;
+    bool any = true;
+    for (; first < end && any; first += BATCH) {
+        const int count = int(end - first < BATCH ? end - first : BATCH);
+        uint64_t masks[BATCH];
+        load_entries<true>(scene, tile, out.records, out.bins.entries + first, count, group, local, masks);
+        if (group == 0) std::memcpy(out.masks + first, masks, sizeof(uint64_t) * size_t(count));
+        list_blocks(masks, count, lists, BATCH + LANES, counts);
+        any = false;
+        for (int b = 0; b < BLOCKS; ++b) {
+            if (!open[b]) continue;
+            if (counts[b]) {
+                blend_block<CHANNELS>(block_at(b), b, local, lists + b * (BATCH + LANES), counts[b], scene.max_alpha, state);
+                open[b] = simd::any(state.open[b]);
+            }
+            any = any || open[b];
+        }
+    }
+    out.used[index] = int32_t((first < end ? first : end) - begin);
+    write_tile<CHANNELS>(scene, tile, group, state, out.planes);
+}
+
+}  // namespace
+
+void splat_blend(const Scene &scene, const Forward &out) {
+    const int64_t tiles = scene.tiles();
+    for (int group = 0; group < scene.groups(); ++group) {
+        const int channels = scene.width_of(group);
+#pragma omp parallel for num_threads(scene.threads) schedule(dynamic, 4)
+        for (int64_t tile = 0; tile < tiles; ++tile) {
+            if (channels == 1) blend_tile<1>(scene, out, tile, group);
+            else if (channels == 2) blend_tile<2>(scene, out, tile, group);
+            else if (channels == 3) blend_tile<3>(scene, out, tile, group);
+            else blend_tile<4>(scene, out, tile, group);
+        }
+    }
+}
+
+}  // namespace MESHANIM_NAMESPACE

@@ -1,0 +1,254 @@
+// The derivative of blending, a tile at a time and in it a block at a time, in three passes over the block's list:
+//   near to far: alphas and weights again, kept;
+//   far to near: with B the colour behind (dotted with the image gradient g), d L / d ln alpha = weight (g.c - B) and
+//     B <- B + alpha (g.c - B), without the division by 1 - alpha that a pass the other way would need;
+//   any order: sums over the block's pixels. Quads of pixels are broadcast against vectors that hold LANES / 4
+//     quantities each, so that no lanes are summed until the tile is done.
+#include <cstring>
+
+#ifdef _OPENMP
+#include <omp.h>
+#endif
+
+#include "isa.h"
+#include "splat.h"
+#include "tile.h"
+
+namespace MESHANIM_NAMESPACE {
+namespace {
+
+using splat::Backward;
+using splat::ImageGradient;
+using splat::MOMENTS;
+using splat::Scene;
+
+constexpr int QUADS = LANES / 4;
+constexpr int MOMENT_VECTORS = (MOMENTS + QUADS - 1) / QUADS;
+template <int CHANNELS> constexpr int VECTORS = MOMENT_VECTORS + (CHANNELS + QUADS - 1) / QUADS;
+
+// A thread's memory for a tile of up to `entries` entries.
+struct Scratch {
+    float *local, *pairs, *sums;
+    int32_t *lists;
+    int64_t stride;
+
+    static int64_t floats(int64_t entries) {
+        return (entries + LANES) * (RECORD + 2 * LANES + VECTORS<splat::GROUP> * LANES + BLOCKS);
+    }
+    Scratch(float *memory, int64_t entries) : stride(entries + LANES) {
+        local = memory;
+        pairs = local + stride * RECORD;
+        sums = pairs + stride * 2 * LANES;
+        lists = reinterpret_cast<int32_t *>(sums + stride * VECTORS<splat::GROUP> * LANES);
+    }
+};
+
+Floats load_gradient(const ImageGradient &gradient, const Tile &tile, const Block &block, int64_t channel) {
+    if (!gradient.data) return broadcast(0.0f);
+    const float *corner = gradient.data + tile.image * gradient.image + (tile.y + block.row) * gradient.y +
+                          (tile.x + block.column) * gradient.x + channel * gradient.channel;
+    float lanes[LANES] = {};
+    for (int l = 0; l < LANES; ++l) {
+        const int row = l / BLOCK_WIDTH, column = l % BLOCK_WIDTH;
+        if (block.row + row < tile.height && block.column + column < tile.width) lanes[l] = corner[row * gradient.y + column * gradient.x];
+    }
+    return simd::load(lanes);
+}
+
+// The polynomials in (u, v) that the moments are sums of, by quads: weights[vector][row of the block] for pixels.
+struct Basis {
+    float weights[BLOCKS][MOMENT_VECTORS][QUADS][LANES];
+    Basis() {
+        for (int b = 0; b < BLOCKS; ++b)
+            for (int m = 0; m < MOMENT_VECTORS; ++m)
+                for (int row = 0; row < QUADS; ++row)
+                    for (int l = 0; l < LANES; ++l) {
+                        const float u = float(b % BLOCK_COLUMNS * BLOCK_WIDTH + l % 4) + 0.5f - TILE / 2;
+                        const float v = float(b / BLOCK_COLUMNS * BLOCK_HEIGHT + row) + 0.5f - TILE / 2;
+                        const float values[MOMENTS] = {1, u, v, u * u, u * v, v * v};
+                        const int quantity = m * QUADS + l / 4;
+                        weights[b][m][row][l] = quantity < MOMENTS ? values[quantity] : 0;
+                    }
+    }
+};
+
+template <int CHANNELS>
+class TileGradient {
+   public:
+    TileGradient(const Scene &scene, const Backward &in, int64_t index, float *memory)
+        : scene_(scene), in_(in), index_(index), tile_(scene, index), begin_(in.bins.tiles[index]),
+          count_(in.used[index]), scratch_(memory, count_) {}
+
+    void run() {
+        const int64_t total = in_.bins.tiles[index_ + 1] - begin_;
+        for (int64_t i = count_; i < total; ++i) std::memset(slot(i), 0, WIDTH * sizeof(float));
+        float *const background = in_.background + index_ * scene_.channels;
+        Floats through[CHANNELS];
+        for (int j = 0; j < CHANNELS; ++j) through[j] = broadcast(0.0f);
+        load_entries<false>(scene_, tile_, in_.records, in_.bins.entries + begin_, count_, in_.group, scratch_.local, nullptr);
+        std::memset(scratch_.sums, 0, sizeof(float) * size_t(count_ * VECTORS<CHANNELS> * LANES));
+        int32_t counts[BLOCKS];
+        list_blocks(in_.masks + begin_, int(count_), scratch_.lists, scratch_.stride, counts);
+        for (int b = 0; b < BLOCKS; ++b) block(b, counts[b], through);
+        for (int64_t first = 0; first < count_; first += LANES) finish(first);
+        for (int j = 0; j < CHANNELS; ++j) {
+            const int64_t channel = int64_t(in_.group) * splat::GROUP + j;
+            if (channel < scene_.channels) background[channel] = simd::sum(through[j]);
+        }
+    }
+
+   private:
+    static constexpr int WIDTH = MOMENTS + CHANNELS;
+
+    float *slot(int64_t i) const { return in_.slots + int64_t(in_.bins.entries[begin_ + i].slot) * WIDTH; }
+
+    void block(int index, int count, Floats (&through)[CHANNELS]) {
+        const Block &block = block_at(index);
+        if (block.row >= tile_.height || block.column >= tile_.width) return;
+        Floats gradient[CHANNELS];
+        Floats behind = in_.group == 0 ? broadcast(0.0f) - load_gradient(in_.alpha, tile_, block, 0) : broadcast(0.0f);
+        for (int j = 0; j < CHANNELS; ++j) {
+            const int64_t channel = int64_t(in_.group) * splat::GROUP + j;
+            const bool color = channel < scene_.channels;
+            gradient[j] = load_gradient(color ? in_.rgb : in_.depths, tile_, block, color ? channel : 0);
+            if (color) behind = fma(gradient[j], broadcast(scene_.background[tile_.image * scene_.channels + channel]), behind);
+        }
+        const int32_t *list = scratch_.lists + index * scratch_.stride;
+        const Floats light = near_to_far(block, list, count);
+        for (int j = 0; j < CHANNELS; ++j) through[j] = fma(gradient[j], light, through[j]);
+        far_to_near(list, count, gradient, behind);
+        add(index, list, count, gradient);
+    }
+
+    // Keeps (alpha, weight) of each pair, zero where nothing was blended; cuts the list where no pixel takes more.
+    Floats near_to_far(const Block &block, const int32_t *list, int &count) {
+        const Floats u = block.u, v = block.v, least = broadcast(splat::LOG2_MIN_ALPHA), most = broadcast(scene_.max_alpha), end = broadcast(splat::MIN_LIGHT);
+        Floats light = broadcast(1.0f);
+        Mask open = block.inside(tile_);
+        float *pair = scratch_.pairs;
+        for (int i = 0; i < count; ++i, pair += 2 * LANES) {
+            const float *e = scratch_.local + list[i];
+            const Floats p = fma(broadcast(e[splat::A]), u, fma(broadcast(e[splat::B]), v, broadcast(e[P])));
+            const Floats q = fma(broadcast(e[splat::C]), v, broadcast(e[Q]));
+            const Floats level = broadcast(e[splat::LEVEL]) - q * q - p * p;
+            const Mask counts = simd::both(open, simd::at_least(level, least));
+            const Floats alpha = simd::minimum(simd::exp2(level), most), left = light - light * alpha;
+            const Mask taken = simd::both(counts, simd::greater(left, end));
+            open = simd::without(open, simd::without(counts, taken));
+            simd::store(pair, simd::keep(taken, alpha));
+            simd::store(pair + LANES, simd::keep(taken, alpha * light));
+            light = simd::select(taken, left, light);
+            if (i % 16 == 15 && !simd::any(open)) count = i + 1;
+        }
+        return light;
+    }
+
+    // Turns alpha into d L / d ln alpha, which is zero where max_alpha acts.
+    void far_to_near(const int32_t *list, int count, const Floats (&gradient)[CHANNELS], Floats behind) {
+        const Floats most = broadcast(scene_.max_alpha);
+        for (int i = count - 1; i >= 0; --i) {
+            const float *e = scratch_.local + list[i];
+            float *pair = scratch_.pairs + int64_t(i) * 2 * LANES;
+            Floats color = broadcast(e[splat::COLOR]) * gradient[0];
+            for (int j = 1; j < CHANNELS; ++j) color = fma(broadcast(e[splat::COLOR + j]), gradient[j], color);
+            const Floats alpha = simd::load(pair), weight = simd::load(pair + LANES), rise = color - behind;
+            behind = fma(alpha, rise, behind);
+            simd::store(pair, simd::keep(simd::greater(most, alpha), weight * rise));
+        }
+    }
+
+    void add(int index, const int32_t *list, int count, const Floats (&gradient)[CHANNELS]) {
+        static const Basis basis;
+        Floats shape[MOMENT_VECTORS][QUADS], paint[VECTORS<CHANNELS> - MOMENT_VECTORS][QUADS];
+        for (int m = 0; m < MOMENT_VECTORS; ++m)
+            for (int row = 0; row < QUADS; ++row) shape[m][row] = simd::load(basis.weights[index][m][row]);
+        float channels[(VECTORS<CHANNELS> - MOMENT_VECTORS) * QUADS][LANES] = {};
+        for (int j = 0; j < CHANNELS; ++j) simd::store(channels[j], gradient[j]);
+        for (int m = 0; m < VECTORS<CHANNELS> - MOMENT_VECTORS; ++m)
+            for (int row = 0; row < QUADS; ++row) {
+                float lanes[LANES];
+                for (int quad = 0; quad < QUADS; ++quad) std::memcpy(lanes + 4 * quad, channels[m * QUADS + quad] + 4 * row, 4 * sizeof(float));
+                paint[m][row] = simd::load(lanes);
+            }
+        for (int i = 0; i < count; ++i) {
+            const float *pair = scratch_.pairs + int64_t(i) * 2 * LANES;
+            float *const sums = scratch_.sums + int64_t(list[i]) / RECORD * (VECTORS<CHANNELS> * LANES);
+            Floats sum[VECTORS<CHANNELS>];
+            for (int m = 0; m < VECTORS<CHANNELS>; ++m) sum[m] = simd::load(sums + m * LANES);
+            for (int row = 0; row < QUADS; ++row) {
+                const Floats change = simd::load_quad(pair + 4 * row), weight = simd::load_quad(pair + LANES + 4 * row);
+                for (int m = 0; m < MOMENT_VECTORS; ++m) sum[m] = fma(change, shape[m][row], sum[m]);
+                for (int m = MOMENT_VECTORS; m < VECTORS<CHANNELS>; ++m) sum[m] = fma(weight, paint[m - MOMENT_VECTORS][row], sum[m]);
+            }
+            for (int m = 0; m < VECTORS<CHANNELS>; ++m) simd::store(sums + m * LANES, sum[m]);
+        }
+    }
+
+    // Moments of LANES entries about the tile's centre become moments of (p, q); writes them to their slots.
+    void finish(int64_t first) {
+        const int count = int(count_ - first < LANES ? count_ - first : LANES);
+        Floats m[MOMENT_VECTORS * QUADS], values[WIDTH];
+        auto quantities = [&](int vector, Floats *out) {
+            Floats rows[LANES], sums[QUADS];
+            for (int l = 0; l < LANES; ++l) rows[l] = simd::load(scratch_.sums + (first + (l < count ? l : 0)) * (VECTORS<CHANNELS> * LANES) + vector * LANES);
+            simd::quad_sums(rows, sums);
+            for (int j = 0; j < QUADS; ++j) out[j] = sums[j];
+        };
+        for (int k = 0; k < MOMENT_VECTORS; ++k) quantities(k, m + k * QUADS);
+        Floats colors[(VECTORS<CHANNELS> - MOMENT_VECTORS) * QUADS];
+        for (int k = MOMENT_VECTORS; k < VECTORS<CHANNELS>; ++k) quantities(k, colors + (k - MOMENT_VECTORS) * QUADS);
+        const float *rows[LANES];
+        for (int l = 0; l < LANES; ++l) rows[l] = scratch_.local + (first + (l < count ? l : 0)) * RECORD;
+        Floats f[FIELDS];
+        load_fields(rows, f);
+        const Floats p = f[P], q = f[Q], a = f[splat::A], b = f[splat::B], c = f[splat::C], two = broadcast(2.0f);
+        const Floats across = fma(a, m[1], b * m[2]);                         // sum of a u + b v
+        const Floats mixed = fma(a, m[4], b * m[5]);                          // of (a u + b v) v
+        const Floats square = fma(a, fma(a, m[3], two * b * m[4]), b * b * m[5]);
+        values[0] = m[0];
+        values[1] = fma(p, m[0], across);
+        values[2] = fma(q, m[0], c * m[2]);
+        values[3] = fma(p, fma(p, m[0], two * across), square);
+        values[4] = fma(q, values[1], c * fma(p, m[2], mixed));
+        values[5] = fma(q, fma(q, m[0], two * c * m[2]), c * c * m[5]);
+        for (int j = 0; j < CHANNELS; ++j) values[MOMENTS + j] = colors[j];
+        for (int part = 0; part < WIDTH; part += LANES) {
+            Floats columns[LANES];
+            for (int j = 0; j < LANES; ++j) columns[j] = part + j < WIDTH ? values[part + j] : broadcast(0.0f);
+            simd::transpose(columns);
+            const int width = WIDTH - part < LANES ? WIDTH - part : LANES;
+            for (int l = 0; l < count; ++l) simd::store_first(slot(first + l) + part, columns[l], width);
+        }
+    }
+
+    const Scene &scene_;
+    const Backward &in_;
+    int64_t index_;
+    Tile tile_;
+    int64_t begin_, count_;
+    Scratch scratch_;
+};
+
+}  // namespace
+
+// Floats that a thread needs for tiles of so many entries.
+int64_t splat_scratch(int64_t entries) { return Scratch::floats(entries); }
+
+void splat_blend_backward(const Scene &scene, const Backward &in) {
+    const int64_t tiles = scene.tiles();
+    const int channels = in.channels;
+#pragma omp parallel for num_threads(scene.threads) schedule(dynamic, 4)
+    for (int64_t tile = 0; tile < tiles; ++tile) {
+#ifdef _OPENMP
+        float *const memory = in.scratch + omp_get_thread_num() * in.scratch_floats;
+#else
+        float *const memory = in.scratch;
+#endif
+        if (channels == 1) TileGradient<1>(scene, in, tile, memory).run();
+        else if (channels == 2) TileGradient<2>(scene, in, tile, memory).run();
+        else if (channels == 3) TileGradient<3>(scene, in, tile, memory).run();
+        else TileGradient<4>(scene, in, tile, memory).run();
+    }
+}
+
+}  // namespace MESHANIM_NAMESPACE
