@@ -106,6 +106,7 @@ def _colors(
     gsplat: ModuleType, gaussians: Gaussians, means: Tensor, poses: Tensor, radii: Tensor, images: torch.Size
 ) -> Float[Tensor, "*images n channels"]:
     if gaussians.sh is None:
+        assert gaussians.colors is not None
         return gaussians.colors[..., None, :, :].expand(*images, *gaussians.colors.shape[-2:])
     rotation, translation = poses[..., :3, :3], poses[..., :3, 3:]
     position = -(rotation.transpose(-1, -2) @ translation)[..., 0]

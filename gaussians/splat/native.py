@@ -64,6 +64,7 @@ def rasterize_native(
     images = background.shape[:-1]
     batch = images[:-1]
     colors = gaussians.colors if gaussians.sh is None else gaussians.sh.flatten(-2)
+    assert colors is not None
     fields = {
         name: _frames(field, dimensions, batch)
         for name, field, dimensions in (

@@ -204,6 +204,7 @@ def _image(
         values = harmonics(directions, seen.sh_degree or 0)
         colors = ((values[..., None] * seen.sh).sum(-2) + 0.5).clamp_min(0.0)
     positions = projection.positions if offsets is None else projection.positions + offsets[order]
+    assert colors is not None
     channels = torch.cat([colors, projection.depths[:, None]], -1)
     tables = (positions, projection.conics, projection.opacities, channels)
     width, height = size
