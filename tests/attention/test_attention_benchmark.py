@@ -1,7 +1,9 @@
 import numpy as np
 import pytest
+import torch
 
 from meshanim.attention.benchmark import BenchmarkOptions, closed_mesh_faces, run
+from meshanim.errors import BackendError
 from meshanim.geometry import TriangleMesh
 
 
@@ -19,4 +21,23 @@ def test_rows_and_ratios():
     ratio = results.value(case, "dense / native", "forward ratio")
     times = [results.value(case, name, "forward") for name in ("dense", "native")]
     assert ratio == pytest.approx(times[0] / times[1])
-    assert results.value("100 vertices", "native", "forward + backward a vertex") > 0
+    for case in ("100 vertices", "100 vertices, numbered at random"):
+        assert results.value(case, "native", "forward + backward a vertex") > 0
+        assert results.value(case, "native", "forward + backward processor time a vertex") > 0
+    traffic = results.value("100 vertices", "native", "traffic")
+    copied = results.value("memory", "copy", "traffic")
+    assert results.value("100 vertices", "native / copy", "traffic share") == pytest.approx(traffic / copied)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_missing_gpu_is_named():
+    with pytest.raises(BackendError, match="no NVIDIA GPU"):
+        run(BenchmarkOptions(device="cuda"))
+
+
+@pytest.mark.cuda
+def test_rows_of_a_gpu():
+    results = run(
+        BenchmarkOptions(vertices=162, batch=1, repeats=1, scaling=(100,), memory_vertices=0, device="cuda")
+    )
+    assert results.value("162 vertices", "dense / cuda", "forward + backward ratio") > 0
