@@ -4,13 +4,15 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import soxr
 import torch
 from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
 from jaxtyping import Float, Float32
+from tqdm import tqdm
+from tyro.conf import arg
 
 from meshanim.audio import SpeechEncoder, Waveform, load_encoder, load_waveform
 from meshanim.audio.encoders import MelEncoder
@@ -56,7 +58,7 @@ class AnimationOptions:
     """
 
     fps: float | None = None
-    subject: str | None = None
+    subject: Annotated[str | None, arg(aliases=["--style"])] = None
     emotion: str = "neutral"
     intensity: float = 1.0
     seed: int = 0
@@ -292,6 +294,7 @@ class Animator:
         speech: str | Path | Waveform,
         options: AnimationOptions | None = None,
         template: Template | None = None,
+        progress: bool = False,
     ) -> MeshSequence:
         """Animate a whole speech.
 
@@ -303,6 +306,8 @@ class Animator:
             How it is performed.
         template : (V, 3), optional
             Who speaks: the face at rest, metres, in one of the network's topologies; its own if not given.
+        progress : bool
+            Whether to show a bar, in seconds of sound.
 
         Raises
         ------
@@ -311,13 +316,14 @@ class Animator:
         """
         fitting = self.on_template(template)
         if fitting is not self:
-            return fitting(speech, options, template)
+            return fitting(speech, options, template, progress)
         waveform = speech if isinstance(speech, Waveform) else load_waveform(speech, rate=None)
         stream = self.open(waveform.rate, options, template)
         block = max(1, waveform.rate)  # a second at a time: memory for the result only
+        starts = range(0, len(waveform.samples), block)
         parts = [
             stream.push(waveform.samples[start : start + block])
-            for start in range(0, len(waveform.samples), block)
+            for start in tqdm(starts, desc="animate", unit="s", disable=not progress)
         ]
         parts.append(stream.finish())
         vertices = np.concatenate([part.vertices for part in parts])

@@ -98,6 +98,7 @@ def test_bad_sound_is_one_line_exit_2_and_no_file(name, tmp_path, capsys):
         (("-o", "talk.mp4", "--size", "33"), "even"),
         (("-o", "talk.npz", "--person", "nobody"), "nobody"),
         (("-o", "talk.npz", "--subject", "nobody"), "nobody"),
+        (("-o", "talk.npz", "--style", "nobody"), "nobody"),
         (("-o", "talk.npz", "--fps", "0"), "fps"),
         (("-o", "talk.npz", "--head", "flame:/nowhere.pkl"), "nowhere"),
         (("-o", "talk.npz", "--model", "nowhere/at-all"), "nowhere"),

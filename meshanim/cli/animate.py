@@ -61,7 +61,7 @@ def animate(options: AnimateOptions) -> None:
     speech = load_waveform(options.speech, rate=None)
     animator = Animator.from_pretrained(options.model, options.head)
     scene = _Scene(animator, options)
-    sequence = animator(speech, options.performance, scene.template)
+    sequence = animator(speech, options.performance, scene.template, progress=sys.stderr.isatty())
     if ending == ".npz":
         sequence.save(options.output)
     elif ending == ".glb":
@@ -70,9 +70,8 @@ def animate(options: AnimateOptions) -> None:
         scene.write_sheet(sequence)
     else:
         scene.write_video(sequence)
-    print(
-        f"wrote {options.output}: {len(sequence)} frames, {sequence.duration:.2f} s at {sequence.fps:g} fps"
-    )
+    count = f"{len(sequence)} frame{'s' if len(sequence) > 1 else ''}"
+    print(f"wrote {options.output}: {count}, {sequence.duration:.2f} s at {sequence.fps:g} fps")
 
 
 class _Scene:
