@@ -8,6 +8,7 @@ from corpus_small import FPS, write_small_corpus
 from meshanim.datasets.meshanim_format import MeshanimDataset
 from meshanim.errors import OptionError
 from meshanim.models.gava import Gava
+from meshanim.training import warm_start
 from meshanim.training.gava import TrainGavaOptions, train_gava
 from meshanim.training.gava_evaluation import EvaluateGavaOptions, evaluate_gava
 from meshanim.training.speech_motion import Clip
@@ -103,6 +104,32 @@ def test_a_run_goes_on_where_it_was_cut(corpus, tmp_path):
         (folder / "model.safetensors").unlink()
     shutil.rmtree(first / "checkpoints" / "0000006")
     again = train_gava(options(corpus, first, train=train), progress=False)
+    a, b = (Gava.from_pretrained(folder).state_dict() for folder in (whole, again))
+    assert all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_a_run_goes_on_where_its_warm_start_was_cut(corpus, tmp_path, monkeypatch):
+    warm = WarmStart(steps=5, batch_windows=2, components=3, field_steps=5)
+    train = TrainConfig(steps=2, learning_rate=1e-3, log_every=1000, save_every=2)
+    whole = train_gava(options(corpus, tmp_path / "whole", warm=warm, train=train), progress=False)
+    asked = {}
+    for part in (warm_start._SpeechFit, warm_start._FieldFit):
+
+        def batch(self, number, *shares, part=part, real=part.batch):
+            asked.setdefault(part, []).append(number)
+            if asked[part] == [0, 1, 2, 3, 4]:
+                raise KeyboardInterrupt
+            return real(self, number, *shares)
+
+        monkeypatch.setattr(part, "batch", batch)
+    cut = options(corpus, tmp_path / "cut", warm=warm, train=train)
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
+            train_gava(cut, progress=False)
+    again = train_gava(cut, progress=False)
+    assert all(numbers == [0, 1, 2, 3, 4, 4] for numbers in asked.values()), (
+        "steps that were saved are not done again"
+    )
     a, b = (Gava.from_pretrained(folder).state_dict() for folder in (whole, again))
     assert all(torch.equal(a[name], b[name]) for name in a)
 
