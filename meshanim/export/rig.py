@@ -17,8 +17,8 @@ def write_rig(path: str | Path, rig: Rig) -> None:
     """Write a rig by the ending of the path: .npz, .glb, or none for a folder of OBJ files.
 
     .npz holds all but texture coordinates, regions included; .glb one mesh with ARKit's names as morph target
-    names, which viewers, Blender and game engines read; the folder neutral.obj and one OBJ a shape. A rig with
-    texture coordinates has its vertices split along seams in .glb. Metres all.
+    names, which viewers, Blender and game engines read; the folder neutral.obj and one OBJ a shape. A rig
+    with texture coordinates has its vertices split along seams in .glb. Metres all.
 
     Raises
     ------
