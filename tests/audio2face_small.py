@@ -4,6 +4,7 @@ import numpy as np
 import torch
 
 from meshanim.audio import Waveform
+from meshanim.models.audio2face.diffusion import Audio2FaceDiffusion, DiffusionConfig
 from meshanim.models.audio2face.regression import Audio2FaceRegression, ImplicitClip, RegressionConfig
 from meshanim.motion.animation_state import Actors, StateBasis
 from meshanim.motion.face_parts import FaceParts
@@ -67,3 +68,31 @@ def noise(seconds, seed=0, rate=16000):
     time = np.arange(int(seconds * rate)) / rate
     loud = np.square(np.sin(2 * np.pi * 1.7 * time))
     return Waveform((0.2 * loud * generator.normal(size=len(time))).astype(np.float32), rate)
+
+
+def small_diffusion(seed=0, **options):
+    """Recurrent and output weights large enough that its frames depend on everything before them."""
+    torch.manual_seed(seed)
+    defaults = {
+        "feature_dim": 80,
+        "encoder": "mel",
+        "identities": ("anna", "ben"),
+        "emotions": ("joy", "anger"),
+        "width": 24,
+    }
+    network = Audio2FaceDiffusion(
+        DiffusionConfig(**(defaults | options)), small_actors(names=("anna", "ben"))
+    )
+    with torch.no_grad():
+        for layer in network.outputs:
+            layer.weight.normal_(std=0.2)
+            layer.bias.normal_(std=0.2)
+        network.feature_mean.fill_(-8.0)
+        network.feature_scale.fill_(3.0)
+        for layer in (*network.geometry, network.geometry_mix, network.speech_mix):
+            if layer is not None:
+                layer.weight.normal_(std=0.2)
+        for weight in network.recurrent.parameters():
+            weight.normal_(std=0.3)
+        network.mean.normal_(std=0.1)
+    return network.eval()

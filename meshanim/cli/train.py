@@ -2,6 +2,7 @@
 
 import sys
 
+from meshanim.training.audio2face_diffusion import TrainDiffusionOptions, train_diffusion
 from meshanim.training.audio2face_regression import TrainRegressionOptions, train_regression
 from meshanim.training.gava import TrainGavaOptions, train_gava
 
@@ -16,4 +17,8 @@ def _regression(options: TrainRegressionOptions) -> None:
     print(f"wrote {train_regression(options, progress=sys.stderr.isatty())}")
 
 
-COMMANDS = {"gava": _gava, "a2f-regression": _regression}
+def _diffusion(options: TrainDiffusionOptions) -> None:
+    print(f"wrote {train_diffusion(options, progress=sys.stderr.isatty())}")
+
+
+COMMANDS = {"gava": _gava, "a2f-regression": _regression, "a2f-diffusion": _diffusion}

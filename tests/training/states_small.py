@@ -19,8 +19,8 @@ from meshanim.geometry import TriangleMesh
 FPS, RATE = 30.0, 16000
 
 
-def write_states(folder, subjects=("anna",), sentences=3, seconds=1.5):
-    """DIR/data, and DIR/a2f made of it; returns the second."""
+def write_states(folder, subjects=("anna",), sentences=3, seconds=1.5, turning=(), curve_names=()):
+    """DIR/data, and DIR/a2f made of it; returns the second. Curves are loudness, half of it, and so on."""
     actors = small_actors(names=subjects)
     parts = actors.basis.parts
     generator = np.random.default_rng(0)
@@ -54,8 +54,12 @@ def write_states(folder, subjects=("anna",), sentences=3, seconds=1.5):
             info = SequenceInfo(
                 name, sentence, "", FPS, frames, phonemes, "joy" if joy else "neutral", float(joy)
             )
-            still, none = np.zeros((frames, 3), np.float32), np.zeros((frames, 0), np.float32)
-            write_sequence(data, MotionSequence(info, vertices, still, none, Waveform(samples, RATE)))
+            pose = np.zeros((frames, 3), np.float32)
+            if name in turning:
+                pose[:, 1] = 0.2 * amount[:, 0, 0]
+            curves = np.stack([amount[:, 0, 0] / 2**k for k in range(len(curve_names))] or [[]] * frames, -1)
+            curves = curves.reshape(frames, len(curve_names)).astype(np.float32)
+            write_sequence(data, MotionSequence(info, vertices, pose, curves, Waveform(samples, RATE)))
             names.append(info.name)
     faces = np.stack([np.arange(count - 2), np.arange(1, count - 1), np.arange(2, count)], axis=1)
     mesh = TriangleMesh(people[0].template, faces)
@@ -64,7 +68,7 @@ def write_states(folder, subjects=("anna",), sentences=3, seconds=1.5):
         "train": [name for name in names if not name.endswith(last)],
         "test": [name for name in names if name.endswith(last)],
     }
-    write_dataset(data, "small", FPS, "", mesh, [], people, splits)
+    write_dataset(data, "small", FPS, "", mesh, curve_names, people, splits)
     parts.save(folder / "parts.json")
     options = StateOptions(skin=6, tongue=2, silence=1.0, pitch=0, voices=0, speech=0)
     prepare_states(open_dataset(data), folder / "a2f", options, parts=folder / "parts.json", workers=1)
