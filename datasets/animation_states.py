@@ -232,6 +232,10 @@ class AnimationStates:
         """Vertices of a clip at some of its times: rows of `ClipArrays.timeline`."""
         return at_positions(self._motion(self.clips[name].sequence), timeline).astype(np.float32)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Worker processes open the source anew."""
+        return {name: value for name, value in vars(self).items() if name not in ("source", "_motion")}
+
     @cached_property
     def _motion(self):
         # Some layouts parse whole files for a few frames.

@@ -19,7 +19,7 @@ from meshanim.models.audio2face.speech import RATE, Hearing, cut_windows, featur
 from meshanim.training.array_rows import ArrayRows
 from meshanim.training.feature_cache import FeatureCache
 
-__all__ = ["SpeechClip", "chosen_subjects", "load_speech_clips"]
+__all__ = ["SpeechClip", "chosen_subjects", "felt", "load_speech_clips"]
 
 FULL_SCALE = 32768.0
 
@@ -85,6 +85,11 @@ def chosen_subjects(states: AnimationStates, subject: str) -> tuple[str, ...]:
             f"{states.directory} has several subjects: choose one with --subject: {', '.join(people)}"
         )
     return (subject,) if subject else people
+
+
+def felt(clips: Sequence[SpeechClip]) -> tuple[str, ...]:
+    """Emotions of clips but neutral, by name."""
+    return tuple(sorted({clip.clip.emotion for clip in clips} - {"neutral"}))
 
 
 def load_speech_clips(

@@ -19,7 +19,7 @@ from meshanim.models.audio2face.diffusion import HEAD, Audio2FaceDiffusion, Diff
 from meshanim.models.audio2face.head_motion import head_of_rotation
 from meshanim.models.audio2face.prompts import TextEncoder, load_text_encoder, prompts
 from meshanim.motion.animation_state import Actors
-from meshanim.training.audio2face_data import SpeechClip, load_speech_clips
+from meshanim.training.audio2face_data import SpeechClip, felt, load_speech_clips
 from meshanim.training.audio2face_losses import (
     CENTIMETRES,
     EYE_RADIUS,
@@ -364,7 +364,7 @@ def train_diffusion(options: TrainDiffusionOptions, progress: bool = True) -> Pa
         feature_dim=encoder.dim,
         encoder=options.encoder,
         identities=people,
-        emotions=() if told else states.emotions[1:],
+        emotions=() if told else felt(clips),
         width=options.width,
         dropout=options.dropout,
         fps=states.fps,

@@ -24,7 +24,7 @@ from meshanim.models.audio2face.regression import (
 )
 from meshanim.models.audio2face.speech import RATE, Hearing, hearing
 from meshanim.motion.animation_state import Actors
-from meshanim.training.audio2face_data import SpeechClip, chosen_subjects, load_speech_clips
+from meshanim.training.audio2face_data import SpeechClip, chosen_subjects, felt, load_speech_clips
 from meshanim.training.audio2face_losses import (
     PRESETS,
     LipReader,
@@ -287,7 +287,7 @@ def train_regression(options: TrainRegressionOptions, progress: bool = True) -> 
         feature_dim=encoder.dim,
         encoder=options.encoder,
         hearing=heard,
-        emotions=states.emotions[1:],
+        emotions=felt(clips),
         languages=sorted(spoken),
         clips=implicit_clips(clips),
         subject=subjects[0],

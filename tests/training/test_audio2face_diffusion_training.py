@@ -1,3 +1,4 @@
+import pickle
 import shutil
 
 import numpy as np
@@ -82,6 +83,15 @@ def test_a_run_goes_on_where_it_was_cut(states, tmp_path, changes):
     a, b = (Audio2FaceDiffusion.from_pretrained(folder).state_dict() for folder in (whole, again))
     assert a.keys() == b.keys()
     assert all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_worker_processes_make_the_same_batches(states, monkeypatch, tmp_path):
+    task, _, _ = task_of(states, monkeypatch, tmp_path, head_motion=True)
+    batch = task.batch(5)  # the source is open, its files are cached
+    other = pickle.loads(pickle.dumps(task)).batch(5)
+    assert batch.keys() == other.keys()
+    for name, value in batch.items():
+        assert torch.equal(value, other[name]) if isinstance(value, torch.Tensor) else value == other[name]
 
 
 def test_the_schedule_is_the_papers(states, monkeypatch, tmp_path):
