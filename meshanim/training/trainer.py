@@ -211,13 +211,16 @@ class Trainer:
             kwargs_handlers=[DistributedDataParallelKwargs(find_unused_parameters=find_unused)],
         )
         torch.manual_seed(config.seed)
-        optimizer = torch.optim.AdamW(
-            model.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
-        )
-        self.model, self.optimizer = self.accelerator.prepare(model, optimizer)
+        self.model, self.optimizer = self._prepare(model)
         self.step = 0
         self.average: dict[str, Tensor] = {}
         self.reset_average()
+
+    def _prepare(self, model: nn.Module) -> tuple[Any, Any]:
+        """The model on its device, with the wrappers of distributed training, and its optimiser."""
+        rate, decay = self.config.learning_rate, self.config.weight_decay
+        optimizer = torch.optim.AdamW(model.parameters(), lr=rate, weight_decay=decay)
+        return self.accelerator.prepare(model, optimizer)
 
     @property
     def bare(self) -> nn.Module:
@@ -264,8 +267,7 @@ class Trainer:
                     raise FloatingPointError(f"the loss of step {self.step} is not finite: {values}")
                 bar.set_postfix({name: f"{value:.4g}" for name, value in values.items()})
                 if writer is not None:
-                    for name, value in values.items():
-                        writer.add_scalar(name, value, self.step)
+                    self._report(writer, values)
             if self.step % config.save_every == 0 or self.step == last:
                 self.save_checkpoint()
         batches.close()
@@ -276,6 +278,11 @@ class Trainer:
             self._save_result()
         accelerator.wait_for_everyone()
         return self.bare
+
+    def _report(self, writer: Any, values: Mapping[str, float]) -> None:
+        """What the main process writes for TensorBoard at every line of the log."""
+        for name, value in values.items():
+            writer.add_scalar(name, value, self.step)
 
     def _logged(self, logs: Mapping[str, Tensor]) -> dict[str, float]:
         """Means over the processes."""
