@@ -33,7 +33,7 @@ def options(states, output, **changes):
         "epochs": 0,
         "batch_pairs": 6,
         "cpu": True,
-        "train": TrainConfig(steps=32, learning_rate=1e-3, log_every=1000, save_every=1000),
+        "train": TrainConfig(steps=42, learning_rate=1e-3, log_every=1000, save_every=1000),
     }
     return TrainRegressionOptions(**(defaults | changes))
 
