@@ -19,7 +19,7 @@ VERBS = {
     "demo": "the same on a recorded sentence that ships with the package",
     "train": "train a model: gava",
     "evaluate": "score models and motion on held-out data, compare scores: gava, motion, compare, ...",
-    "avatar": "Gaussian avatars: fit to pictures, evaluate on held-out ones",
+    "avatar": "Gaussian avatars: fit to pictures, evaluate on held-out ones, render",
     "data": "data sets: synthesize, info, check, convert, augment-pose, personalize, ...",
     "solve": "the motion of a mesh in, blendshape weights out",
     "bench": "measurements that anyone can repeat: attention, animate, binding, image-loss, solve",

@@ -18,7 +18,7 @@ from meshanim.files import check_writable
 from meshanim.heads import DefaultHead
 from meshanim.motion import MeshSequence
 
-__all__ = ["COMMANDS", "AnimateOptions", "animate"]
+__all__ = ["COMMANDS", "AnimateOptions", "Scene", "animate", "announce", "perform"]
 
 ENDINGS = (".mp4", ".glb", ".npz", ".png")
 
@@ -43,6 +43,9 @@ class AnimateOptions:
     """Who, on the default head: one of the twelve people that `docs/look.md` shows."""
     skin: Path | None = None
     """Picture in MakeHuman's layout that replaces the painted skin."""
+    avatar: str | None = None
+    """A Gaussian avatar speaks instead of a mesh, on its own head: model/ of what `meshanim avatar fit`
+    wrote. Writes mp4 or png; `meshanim avatar render` has cameras and backgrounds."""
     quality: Literal["full", "draft"] = "full"
     """Of pictures: full has hair, subsurface scattering and anti-aliasing; draft is faster than real time."""
     size: int = 512
@@ -52,16 +55,16 @@ class AnimateOptions:
 
 def animate(options: AnimateOptions) -> None:
     """Run the verb."""
+    if options.avatar is not None:
+        _animate_avatar(options.avatar, options)
+        return
     ending = options.output.suffix.lower()
     if ending not in ENDINGS:
         raise OptionError(f"cannot write {options.output}: the ending must be one of {', '.join(ENDINGS)}")
     if options.size < 16 or options.size % 2:
         raise OptionError(f"size must be even and at least 16, not {options.size}")
     check_writable(options.output)
-    speech = load_waveform(options.speech, rate=None)
-    animator = Animator.from_pretrained(options.model, options.head)
-    scene = _Scene(animator, options)
-    sequence = animator(speech, options.performance, scene.template, progress=sys.stderr.isatty())
+    scene, sequence = perform(options)
     if ending == ".npz":
         sequence.save(options.output)
     elif ending == ".glb":
@@ -70,11 +73,42 @@ def animate(options: AnimateOptions) -> None:
         scene.write_sheet(sequence)
     else:
         scene.write_video(sequence)
+    announce(options.output, sequence)
+
+
+def announce(output: Path, sequence: MeshSequence) -> None:
+    """Say what was written."""
     count = f"{len(sequence)} frame{'s' if len(sequence) > 1 else ''}"
-    print(f"wrote {options.output}: {count}, {sequence.duration:.2f} s at {sequence.fps:g} fps")
+    print(f"wrote {output}: {count}, {sequence.duration:.2f} s at {sequence.fps:g} fps")
 
 
-class _Scene:
+def perform(options: AnimateOptions) -> tuple["Scene", MeshSequence]:
+    """What is drawn, and how it moves."""
+    speech = load_waveform(options.speech, rate=None)
+    animator = Animator.from_pretrained(options.model, options.head)
+    scene = Scene(animator, options)
+    sequence = animator(speech, options.performance, scene.template, progress=sys.stderr.isatty())
+    return scene, sequence
+
+
+def _animate_avatar(avatar: str, options: AnimateOptions) -> None:
+    from meshanim.cli.avatar import RenderOptions, render
+
+    if options.head != "default" or options.skin is not None:
+        raise OptionError("--head and --skin are of meshes; an avatar has its own")
+    render(
+        RenderOptions(
+            avatar,
+            audio=options.speech,
+            output=options.output,
+            size=options.size,
+            model=options.model,
+            performance=options.performance,
+        )
+    )
+
+
+class Scene:
     """What is drawn: a person on the default head, or clay on any other."""
 
     def __init__(self, animator: Animator, options: AnimateOptions):

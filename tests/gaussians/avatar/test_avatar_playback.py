@@ -1,0 +1,169 @@
+"""An avatar plays animations of any identity and topology; the command writes videos and sheets."""
+
+import av
+import numpy as np
+import pytest
+import soundfile
+import torch
+from PIL import Image
+
+from meshanim.cli import main
+from meshanim.cli.animate import AnimateOptions
+from meshanim.cli.demo import side_by_side
+from meshanim.errors import ShapeError
+from meshanim.gaussians.avatar.model import Avatar, AvatarConfig
+from meshanim.gaussians.avatar.playback import avatar_template, on_avatar, play
+from meshanim.gaussians.camera_paths import camera_path
+from meshanim.geometry import decimate
+from meshanim.heads import HeadParameters, load_head
+from meshanim.motion import MeshSequence
+
+
+@pytest.fixture(scope="module")
+def head():
+    return load_head("default")
+
+
+@pytest.fixture(scope="module")
+def avatar(head):
+    """Of somebody other than the template, a few large blots, grey, but white teeth; no colour network."""
+    shape = torch.linspace(-1, 1, len(head.shape_names))[None]
+    face = torch.arange(0, head.mesh.n_faces, 20)
+    config = AvatarConfig(latent=0, background=(0.0, 0.0, 1.0))
+    made = Avatar(config, head, shape=shape, face=face, scale=(2.0, 0.5, 2.0), opacity=0.95)
+    teeth = torch.from_numpy(np.isin(head.mesh.faces, head.regions["teeth"]).all(1))[face]
+    with torch.no_grad():
+        made.sh0[:] = torch.where(teeth[:, None, None], 1.7, -0.3)
+        made.sh_rest[:] = 0
+    return made.eval()
+
+
+@pytest.fixture(scope="module")
+def folder(avatar, tmp_path_factory):
+    path = tmp_path_factory.mktemp("avatar") / "model"
+    avatar.save_pretrained(path)
+    return path
+
+
+def yawn(head, frames: int = 3) -> MeshSequence:
+    """The template opens its jaw and turns its head."""
+    weights = torch.linspace(0, 1, frames)
+    vertices = head.deform(None, head.expression({"jawOpen": weights})).numpy()
+    pose = np.zeros((frames, 3), np.float32)
+    pose[:, 1] = np.linspace(0, 0.4, frames)
+    return MeshSequence(vertices, 10.0, head.mesh, pose)
+
+
+def test_moves_are_those_of_the_sequence_on_the_avatars_face(head, avatar):
+    sequence = yawn(head)
+    vertices = on_avatar(avatar, sequence)
+    template = avatar_template(avatar)
+    assert np.abs(template - head.mesh.vertices).max() > 1e-3
+    np.testing.assert_allclose(vertices[0], template, atol=1e-6)
+    weights = head.expression({"jawOpen": 1.0})
+    expected = avatar.head(HeadParameters(shape=avatar.shape, expression=weights))[0].detach().numpy()
+    np.testing.assert_allclose(vertices[2], expected, atol=1e-5)
+
+
+def test_another_topology_opens_the_same_mouth(head, avatar):
+    small = decimate(head.mesh, 2500)
+    moves = yawn(head).vertices - head.mesh.vertices.astype(np.float32)
+    carried = small.operator @ moves[2]
+    frames = np.stack([small.mesh.vertices, small.mesh.vertices + carried]).astype(np.float32)
+    vertices = on_avatar(avatar, MeshSequence(frames, 10.0, small.mesh))
+    lips = np.concatenate([head.regions["lips"], head.regions["jaw"]])
+    error = np.linalg.norm((vertices[1] - vertices[0] - moves[2])[lips], axis=1)
+    assert np.median(error) < 0.25 * np.median(np.linalg.norm(moves[2][lips], axis=1))
+
+
+def test_pictures_are_those_of_the_posed_head(head, avatar):
+    sequence = yawn(head)
+    cameras = camera_path("front", avatar_template(avatar), 3, 10.0, 48, 48)
+    frames = list(play(avatar, sequence, cameras, background=(0.0, 1.0, 0.0)))
+    assert [frame.shape for frame in frames] == [(48, 48, 3)] * 3
+    assert frames[0][0, 0].tolist() == [0, 255, 0]
+    parameters = HeadParameters(
+        expression=head.expression({"jawOpen": 1.0}), neck=torch.from_numpy(sequence.pose[2:])
+    )
+    posed = head.pose(torch.from_numpy(on_avatar(avatar, sequence)[2:]), parameters.neck, avatar.shape)
+    still = type(cameras)(cameras.world_to_camera[0], cameras.intrinsics[0], 48, 48)
+    with torch.no_grad():
+        seen = avatar(posed, still, (0.0, 1.0, 0.0)).rgb[0, 0]
+    np.testing.assert_allclose(frames[2], 255 * seen.clamp(0, 1).numpy(), atol=0.51)
+    assert np.abs(frames[2].astype(int) - frames[0]).max() > 60  # it moved
+    with pytest.raises(ShapeError, match="one a frame"):
+        play(avatar, sequence, still)
+
+
+def test_colours_get_the_weights_that_made_the_vertices(head, avatar):
+    """With a colour network that shows jawOpen, the picture of an open jaw differs by it."""
+    torch.manual_seed(0)
+    colored = Avatar(AvatarConfig(latent=2), head, face=torch.arange(0, head.mesh.n_faces, 100))
+    sequence = yawn(head)
+    asked = []
+    colored.colors.register_forward_hook(lambda module, inputs, output: asked.append(inputs[1]))
+    cameras = camera_path("front", avatar_template(colored), 3, 10.0, 16, 16)
+    list(play(colored, sequence, cameras))
+    drive = torch.cat(asked)[:, head.expression_names.index("jawOpen")]
+    torch.testing.assert_close(drive, torch.tensor([0.0, 0.5, 1.0]), atol=0.06, rtol=0)
+
+
+def run(*words) -> int:
+    return main([str(word) for word in words])
+
+
+def test_the_command_plays_motion_with_sound(head, folder, tmp_path):
+    yawn(head, 5).save(tmp_path / "yawn.npz")
+    soundfile.write(tmp_path / "a.wav", np.zeros(8000), 16000)
+    words = ("avatar", "render", folder, "--motion", tmp_path / "yawn.npz", "--size", 32)
+    out = tmp_path / "yawn.mp4"
+    assert run(*words, "--audio", tmp_path / "a.wav", "--camera", "orbit", "-o", out) == 0
+    with av.open(str(out)) as file:
+        pictures = [frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)]
+        assert len(file.streams.audio) == 1
+    assert np.shape(pictures) == (5, 32, 32, 3)
+    assert pictures[0][0, 0].tolist() == pytest.approx([0, 0, 255], abs=12)
+    out = tmp_path / "yawn.png"
+    assert run(*words, "--background", 1, 0, 0, "-o", out) == 0
+    sheet = Image.open(out)
+    assert sheet.size == (6 * 32, 32)
+    assert sheet.getpixel((1, 30)) == (255, 0, 0)
+
+
+def test_the_command_says_speech(folder, tmp_path):
+    time = np.arange(3200) / 16000
+    soundfile.write(tmp_path / "a.wav", 0.1 * np.sin(2 * np.pi * 120 * time), 16000)
+    assert run("animate", tmp_path / "a.wav", "--avatar", folder, "--size", 32, "-o", tmp_path / "a.mp4") == 0
+    with av.open(str(tmp_path / "a.mp4")) as file:
+        assert len(list(file.decode(video=0))) == 6
+
+
+def test_mesh_and_avatar_say_the_same_side_by_side(folder, tmp_path):
+    soundfile.write(tmp_path / "a.wav", np.zeros(2000), 16000)
+    options = AnimateOptions(tmp_path / "a.wav", tmp_path / "a.mp4", size=32, quality="draft")
+    side_by_side(options, str(folder))
+    with av.open(str(tmp_path / "a.mp4")) as file:
+        pictures = [frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)]
+    assert np.shape(pictures) == (4, 32, 64, 3)
+    assert np.ptp(pictures[0][:, :32], axis=(0, 1)).max() > 40
+    assert pictures[0][0, -1].tolist() == pytest.approx([0, 0, 255], abs=16)
+
+
+@pytest.mark.parametrize(
+    ("words", "error"),
+    [
+        (("-o", "a.mp4"), "give --motion"),
+        (("--audio", "a.wav", "-o", "a.gif"), "must be one of .mp4, .png"),
+        (("--audio", "a.wav", "--size", 33), "even"),
+        (("--audio", "a.wav", "--background", 2, 0, 0), "within 0 to 1"),
+        (("--audio", "missing.wav",), "missing.wav"),
+        (("--motion", "yawn.npz", "--camera", "behind"), "front, orbit"),
+    ],
+)  # fmt: skip
+def test_bad_input_is_one_line(head, folder, tmp_path, monkeypatch, capsys, words, error):
+    monkeypatch.chdir(tmp_path)
+    yawn(head).save("yawn.npz")
+    assert run("avatar", "render", folder, *words) == 2
+    printed = capsys.readouterr().err.strip()
+    assert error in printed
+    assert "\n" not in printed
