@@ -147,14 +147,13 @@ def face_parts(head: Head) -> FaceParts:
     skin = np.setdiff1d(np.arange(len(vertices)), others)
     follows = _jaw_travel(head)
     teeth = regions["teeth"]
-    lower_teeth = teeth[follows[teeth] > 0.5]
-    if len(lower_teeth) >= 5:
-        candidates = lower_teeth
-    else:
+    # Back teeth travel less than front ones where a shape opens the jaw; upper ones do not.
+    lower_teeth = teeth[follows[teeth] > 0.25 * max(float(follows[teeth].max(initial=0)), 0.1)]
+    candidates = lower_teeth
+    if len(lower_teeth) < 5:
         candidates = np.setdiff1d(regions["jaw"], regions["lips"])
-    # The middle of the jaw's own travel: what moves with the bone and not with the cheeks.
-    if len(candidates):
-        candidates = candidates[follows[candidates] >= 0.7 * follows[candidates].max()]
+        # What moves with the bone and not with the cheeks.
+        candidates = candidates[follows[candidates] >= 0.7 * follows[candidates].max(initial=0)]
     eyes = {
         side: regions.get(f"{side}_eye", regions["eyes"][sign * vertices[regions["eyes"], 0] > 0])
         for side, sign in (("left", 1), ("right", -1))

@@ -152,6 +152,24 @@ def test_a_head_without_pairs_of_its_own_gets_them_from_its_jaw(head, parts):
     assert (opened[upper, 1] - opened[lower, 1] > 0.008).all()
 
 
+def test_a_rig_without_joints_follows_its_shape_jaw_open(head, parts):
+    plain = Head(
+        head.mesh,
+        np.zeros((head.n_vertices, 3, 0)),
+        np.moveaxis(head.expression_directions.unflatten(1, (-1, 3)).numpy(), 0, -1),
+        [],
+        head.expression_names,
+        head.rest_joints.numpy(),
+        np.zeros((5, 3, 0)),
+        np.eye(5)[np.ones(head.n_vertices, int)],
+        head.regions,
+    )
+    found = face_parts(plain)
+    assert set(found.jaw_points) <= set(head.regions["teeth"])
+    assert (head.weights[found.jaw_points, 2] == 1).all()
+    np.testing.assert_array_equal(found.jaw_rigid, parts.jaw_rigid)
+
+
 def test_parts_in_a_file(parts, tmp_path, unchecked):
     parts.save(tmp_path / "parts.json")
     loaded = FaceParts.load(tmp_path / "parts.json")
