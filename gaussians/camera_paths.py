@@ -102,10 +102,13 @@ def read_camera_path(path: str | Path, frames: int) -> Cameras:
 
 
 def _still(camera: Cameras, frames: int) -> Cameras:
-    matrices = (
-        matrix.expand(frames, *matrix.shape) for matrix in (camera.world_to_camera, camera.intrinsics)
+    pose, intrinsics = camera.world_to_camera, camera.intrinsics
+    return Cameras(
+        pose.expand(frames, *pose.shape),
+        intrinsics.expand(frames, *intrinsics.shape),
+        camera.width,
+        camera.height,
     )
-    return Cameras(*matrices, camera.width, camera.height)
 
 
 def _one_a_frame(path: Cameras) -> Cameras:
