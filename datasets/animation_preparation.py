@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache, partial
@@ -35,7 +36,7 @@ from meshanim.motion.animation_state import Actors, StateBasis, read_actors, wri
 from meshanim.motion.components import PrincipalComponents, principal_components
 from meshanim.motion.face_parts import FaceParts, face_parts
 
-__all__ = ["StateOptions", "prepare_states"]
+__all__ = ["Preparation", "StateOptions", "prepare_states"]
 
 BLOCK = 64
 SILENCE_RATE = 16000
@@ -93,6 +94,26 @@ class StateOptions:
 
 
 @dataclass(frozen=True)
+class Preparation:
+    """What a preparation made.
+
+    Parameters
+    ----------
+    explained : dict
+        Share of the variance that the components of skin and tongue hold.
+    made, labels : dict
+        Clips by how they were made, and recorded ones by where their phonemes are from.
+    lacking : tuple of str
+        Parts that nothing names on this mesh: they have no columns, or are not measured.
+    """
+
+    explained: dict[str, float]
+    made: dict[str, int]
+    labels: dict[str, int]
+    lacking: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class _Job:
     source: DatasetSource
     target: Path
@@ -110,7 +131,7 @@ def prepare_states(
     workers: int = 0,
     dask: str = "",
     progress: bool = False,
-) -> dict[str, float]:
+) -> Preparation:
     """Write animation states of a data set (Audio2Face-3D, Sec. 3); what an earlier run wrote is kept.
 
     Parameters
@@ -129,11 +150,6 @@ def prepare_states(
         As `run_jobs`.
     progress : bool
         Show bars.
-
-    Returns
-    -------
-    dict
-        Share of the variance that the components of skin and tongue explain, and counts.
 
     Raises
     ------
@@ -169,8 +185,12 @@ def prepare_states(
     clips += _silences(directory, dataset, options, [clip for clip in clips if clip.made == "recorded"])
     emotions = ("neutral", *sorted({clip.emotion for clip in clips} - {"neutral"}))
     write_states(directory, dataset.source, dataset.fps, head or dataset.head, emotions, explained, clips)
-    counts = {made: sum(clip.made == made for clip in clips) for made in {clip.made for clip in clips}}
-    return {**explained, **dict(sorted(counts.items()))}
+    return Preparation(
+        explained,
+        dict(sorted(Counter(clip.made for clip in clips).items())),
+        dict(sorted(Counter(clip.labels for clip in clips if clip.made == "recorded").items())),
+        tuple(name for name, value in face.arrays().items() if not len(value)),
+    )
 
 
 def _parts(dataset: MotionDataset, head: str, path: Path | None) -> FaceParts:

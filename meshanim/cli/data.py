@@ -381,7 +381,7 @@ def _augment_pose(options: AugmentPoseOptions) -> int:
 
 
 def _states(options: StatesOptions) -> int:
-    made = prepare_states(
+    done = prepare_states(
         options.reading.open(options.directory),
         options.output,
         options.states,
@@ -391,11 +391,14 @@ def _states(options: StatesOptions) -> int:
         options.dask,
         progress=sys.stderr.isatty(),
     )
-    skin, tongue = made.pop("skin"), made.pop("tongue")
-    print(f"wrote {options.output}: {', '.join(f'{count} {kind}' for kind, count in made.items())} clips")
+    skin, tongue = (100 * done.explained[part] for part in ("skin", "tongue"))
     print(
-        f"components hold {100 * skin:.2f} % of the skin's and {100 * tongue:.2f} % of the tongue's variance"
+        f"wrote {options.output}: {', '.join(f'{count} {made}' for made, count in done.made.items())} clips"
     )
+    print(f"components hold {skin:.2f} % of the skin's and {tongue:.2f} % of the tongue's variance")
+    print(f"phonemes: {', '.join(f'{count} {source}' for source, count in done.labels.items())}")
+    if done.lacking:
+        print(f"this mesh has no {', '.join(done.lacking)}: not part of the states, or not measured")
     return 0
 
 

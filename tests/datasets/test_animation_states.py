@@ -89,16 +89,11 @@ def corpus(tmp_path_factory, head):
 @pytest.fixture(scope="module")
 def states(corpus, tmp_path_factory):
     folder = tmp_path_factory.mktemp("states") / "a2f"
-    counts = prepare_states(open_dataset(corpus), folder, workers=1)
-    assert counts == {
-        "skin": pytest.approx(1),
-        "tongue": pytest.approx(1),
-        "recorded": 3,
-        "pitch": 2,
-        "voice": 2,
-        "speech": 2,
-        "silence": 2,
-    }
+    done = prepare_states(open_dataset(corpus), folder, workers=1)
+    assert done.explained == {"skin": pytest.approx(1), "tongue": pytest.approx(1)}
+    assert done.made == {"recorded": 3, "pitch": 2, "voice": 2, "speech": 2, "silence": 2}
+    assert done.labels == {"given": 3}
+    assert done.lacking == ()
     return AnimationStates(folder)
 
 
@@ -196,7 +191,9 @@ def test_a_second_run_keeps_the_first_and_refuses_another(states, corpus, tmp_pa
 def test_the_published_layout_becomes_states(tmp_path):
     truth, turned = write_tree(tmp_path / "claire", frames=60)
     options = StateOptions(skin=5, tongue=2, pitch=0, voices=0, speech=0, silence=0.5)
-    prepare_states(open_dataset(tmp_path / "claire"), tmp_path / "a2f", options, workers=1)
+    done = prepare_states(open_dataset(tmp_path / "claire"), tmp_path / "a2f", options, workers=1)
+    assert done.lacking == ("jaw_rigid", "right_eye", "left_eye")
+    assert done.labels["none"] == 1  # Mandarin
     states = AnimationStates(tmp_path / "a2f")
     assert states.basis.sizes == {"skin": 5, "tongue": 2, "jaw": 15, "eyes": 4}
     arrays = states.arrays("eg1")
@@ -274,6 +271,9 @@ def test_command_line(corpus, tmp_path, capsys):
     arguments = ["data", "a2f", str(corpus), "-o", str(tmp_path / "a2f"), "--workers", "1", "--skin", "4"]
     arguments += ["--speech", "0", "--voices", "0", "--pitch", "0"]
     assert main(arguments) == 0
-    assert "3 recorded, 2 silence clips" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "3 recorded, 2 silence clips" in said
+    assert "phonemes: 3 given" in said
+    assert "has no" not in said
     assert AnimationStates(tmp_path / "a2f").basis.sizes["skin"] == 4
     assert main(["data", "a2f", str(tmp_path / "nothing"), "-o", str(tmp_path / "b")]) == 2
