@@ -174,8 +174,8 @@ def _scores(
     rendered: Tensor, truth: Tensor, areas: dict[str, np.ndarray], perceptual: Lpips | None
 ) -> dict[str, float]:
     square = (rendered - truth).square().mean(-1)
-    planes = (image.movedim(-1, 0)[None] for image in (rendered, truth))
-    _, similar = structural_similarity_index_measure(*planes, data_range=1.0, return_full_image=True)
+    first, second = (image.movedim(-1, 0)[None] for image in (rendered, truth))
+    _, similar = structural_similarity_index_measure(first, second, data_range=1.0, return_full_image=True)
     similar = similar[0].mean(0)
     scores = {}
     for name, area in areas.items():

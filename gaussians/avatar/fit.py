@@ -59,6 +59,8 @@ class FitAvatarOptions:
     tracking_noise: str = ""
     """Disturb the parameters first, as a test: rotation=0.01,translation=0.001,expression=0.03 are standard
     deviations in radians, metres and weights."""
+    half: bool = False
+    """Write the avatar with floats of 16 bits: half the size, for an avatar to pass on."""
     resume: bool = False
     """Go on from the newest checkpoint in the output folder."""
     save_every: int = 2000
@@ -117,7 +119,7 @@ def fit_avatar(options: FitAvatarOptions, progress: bool = True) -> Results:
     )
     learner = AvatarLearner(avatar, Tracking(parameters, len(capture.timesteps)), options.refine_tracking)
     store = PictureStore(capture, behind if composed else None)
-    task = AvatarTask(store, views, settings, options.seed)
+    task = AvatarTask(store, views, settings, options.seed, options.half)
     train = TrainConfig(
         steps=settings.iterations,
         seed=options.seed,
@@ -197,14 +199,23 @@ class AvatarTask:
         Weights of the loss, coarse stage.
     seed : int
         Of the order.
+    half : bool
+        Whether the avatar is written with 16 bits a number.
     """
 
-    def __init__(self, store: PictureStore, views: tuple[int, ...], settings: FitSettings, seed: int):
-        self.store, self.views, self.settings, self.seed = store, views, settings, seed
+    def __init__(
+        self,
+        store: PictureStore,
+        views: tuple[int, ...],
+        settings: FitSettings,
+        seed: int,
+        half: bool = False,
+    ):
+        self.store, self.views, self.settings, self.seed, self.half = store, views, settings, seed, half
         self.seen: tuple[Gaussians, Rendering] | None = None
         self._order: tuple[int, np.ndarray] | None = None
 
-    def batch(self, number: int, share: int, shares: int) -> Mapping[str, Any]:
+    def batch(self, number: int, share: int = 0, shares: int = 1) -> Mapping[str, Any]:
         """The picture of a step."""
         lap, place = divmod(number * shares + share, len(self.views))
         if self._order is None or self._order[0] != lap:
@@ -239,14 +250,15 @@ class AvatarTask:
     def save(self, model: nn.Module, directory: Path) -> None:
         """The avatar's files, and tracking.safetensors: how the head was posed."""
         assert isinstance(model, AvatarLearner)
-        model.avatar.write(directory)
+        model.avatar.write(directory, self.half)
         rows = {name: rows.detach().cpu().contiguous() for name, rows in model.tracking.named_parameters()}
         save_file(rows, directory / "tracking.safetensors")
 
 
 def regularization(avatar: Avatar, weights: Regularizers, visible: Tensor | None = None) -> Tensor:
     """GaussianAvatars, Eqs. 5, 6: mean relu(|mu| - a) and mean |relu(s - b)| over the visible Gaussians."""
-    means, scales = avatar.means, avatar.scales
+    means: Tensor = avatar.means
+    scales: Tensor = avatar.scales
     if visible is not None:
         means, scales = means[visible], scales[visible]
     # |mu| of a Gaussian at the origin has no direction to go.

@@ -80,8 +80,10 @@ class PictureStore:
         """The camera of a picture."""
         view = self.capture.views[index]
         view = view.scaled(0.5) if half else view
-        matrices = (torch.from_numpy(m).float()[None] for m in (view.world_to_camera, view.intrinsics))
-        return Cameras(*matrices, view.width, view.height)
+        pose, intrinsics = (
+            torch.from_numpy(m).float()[None] for m in (view.world_to_camera, view.intrinsics)
+        )
+        return Cameras(pose, intrinsics, view.width, view.height)
 
     def _decoded(self, index: int, half: bool) -> Tensor:
         picture = self.capture[index]

@@ -113,6 +113,21 @@ class ColorSettings:
     hidden: int = 32
 
 
+PAPER_RATES = {
+    "means": Rate(5e-3, 0.01),
+    "scales": Rate(0.017),
+    "rotations": Rate(1e-3),
+    "opacities": Rate(0.05),
+    "sh0": Rate(2.5e-3),
+    "sh_rest": Rate(1.25e-4),
+    "latents": Rate(2.5e-3),
+    "network": Rate(1e-3),
+    "expression": Rate(1e-3),
+    "pose": Rate(1e-5),
+    "translation": Rate(1e-6),
+}
+
+
 @dataclass(frozen=True)
 class FitSettings:
     """A whole fit.
@@ -151,32 +166,22 @@ class FitSettings:
     coarse: float = 0.0
 
 
-PAPER_RATES = {
-    "means": Rate(5e-3, 0.01),
-    "scales": Rate(0.017),
-    "rotations": Rate(1e-3),
-    "opacities": Rate(0.05),
-    "sh0": Rate(2.5e-3),
-    "sh_rest": Rate(1.25e-4),
-    "latents": Rate(2.5e-3),
-    "network": Rate(1e-3),
-    "expression": Rate(1e-3),
-    "pose": Rate(1e-5),
-    "translation": Rate(1e-6),
-}
-_FALL = {"end": 0.03, "level": 0.3, "delay": 50, "delay_factor": 0.02}
+def _falling(start: float) -> Rate:
+    return Rate(start, end=0.03, level=0.3, delay=50, delay_factor=0.02)
+
+
 SMALL_RATES = {
-    "means": Rate(8e-3, **_FALL),
-    "scales": Rate(1.7e-2, **_FALL),
-    "rotations": Rate(1e-2, **_FALL),
-    "opacities": Rate(5e-2, **_FALL),
-    "sh0": Rate(3.5e-2, **_FALL),
-    "sh_rest": Rate(2e-3, **_FALL),
-    "latents": Rate(1e-2, **_FALL),
-    "network": Rate(2e-3, **_FALL),
-    "expression": Rate(2e-3, **_FALL),
-    "pose": Rate(5e-4, **_FALL),
-    "translation": Rate(5e-5, **_FALL),
+    "means": _falling(8e-3),
+    "scales": _falling(1.7e-2),
+    "rotations": _falling(1e-2),
+    "opacities": _falling(5e-2),
+    "sh0": _falling(3.5e-2),
+    "sh_rest": _falling(2e-3),
+    "latents": _falling(1e-2),
+    "network": _falling(2e-3),
+    "expression": _falling(2e-3),
+    "pose": _falling(5e-4),
+    "translation": _falling(5e-5),
 }
 PRESETS = {
     "paper": FitSettings(),

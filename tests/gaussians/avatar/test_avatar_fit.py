@@ -190,9 +190,21 @@ def test_lpips_by_a_file_of_weights(tmp_path):
 
 
 def test_commands(capture, tiny, tmp_path, capsys):
-    words = ["avatar", "fit", str(capture), "-o", str(tmp_path / "run"), "--iterations", "12", "--size", "16"]
+    words = [
+        "avatar",
+        "fit",
+        str(capture),
+        "-o",
+        str(tmp_path / "run"),
+        "--iterations",
+        "12",
+        "--size",
+        "16",
+        "--half",
+    ]
     assert main(words) == 0
     assert "gaussians" in capsys.readouterr().out
+    assert load_file(tmp_path / "run" / "model" / "avatar.safetensors")["means"].dtype == torch.float16
     scores = tmp_path / "scores.json"
     words = ["avatar", "evaluate", str(tmp_path / "run"), str(capture), "--size", "16", "--json", str(scores)]
     assert main(words) == 0
