@@ -120,14 +120,16 @@ def _colors(
 def _gsplat(max_alpha: float) -> ModuleType:
     try:
         import gsplat
-        from gsplat.cuda._backend import _C
     except ImportError as error:
         raise DependencyError("gsplat", "cuda") from error
+    remedy = "install a CUDA toolkit that fits torch's CUDA, or use backend='reference'"
+    try:
+        from gsplat.cuda._backend import _C
+    except (ImportError, RuntimeError, OSError) as error:
+        reason = str(error).splitlines()[0]
+        raise BackendError(f"gsplat could not compile its kernels ({reason}): {remedy}") from error
     if _C is None:
-        raise BackendError(
-            "gsplat found no CUDA toolkit to compile its kernels with: install one that fits torch's CUDA, "
-            "or use backend='reference'"
-        )
+        raise BackendError(f"gsplat found no CUDA toolkit to compile its kernels with: {remedy}")
     version = tuple(int(part) for part in gsplat.__version__.split(".")[:2])
     compiled = 0.999 if version < (1, 6) else 0.99
     if max_alpha != compiled:

@@ -19,7 +19,7 @@ try:
 except ImportError:  # the extension is optional; `available` says so and rasterize raises BackendError
     _native = None
 
-__all__ = ["available", "rasterize_native"]
+__all__ = ["available", "rasterize_native", "work"]
 
 # From this many floats on, gradients come from the pool of the extension, which keeps their pages.
 POOLED = 1 << 18
@@ -62,37 +62,8 @@ def rasterize_native(
     if cameras.intrinsics.requires_grad and torch.is_grad_enabled():
         raise OptionError("backend 'native' has no gradients to intrinsics: use backend='reference'")
     images = background.shape[:-1]
-    batch = images[:-1]
-    colors = gaussians.colors if gaussians.sh is None else gaussians.sh.flatten(-2)
-    assert colors is not None
-    fields = {
-        name: _frames(field, dimensions, batch)
-        for name, field, dimensions in (
-            ("means", gaussians.means, 2),
-            ("quaternions", gaussians.quaternions, 2),
-            ("scales", gaussians.scales, 2),
-            ("opacities", gaussians.opacities, 1),
-            ("colors", colors, 2),
-        )
-    }
-    views = _Views(
-        0 if gaussians.sh is None else gaussians.sh.shape[-2],
-        len(cameras),
-        cameras.width,
-        cameras.height,
-        options.near,
-        min(options.far, 3e38),
-        options.eps2d,
-        options.max_alpha,
-        options.antialiased,
-        options.depth is not None,
-    )
-    poses = cameras.world_to_camera.expand(*images, 4, 4).reshape(-1, 4, 4).contiguous()
-    intrinsics = cameras.intrinsics.expand(*images, 3, 3).reshape(-1, 3, 3).contiguous()
-    behind = background.reshape(-1, background.shape[-1]).contiguous()
-    finite, rgb, alpha, depth, radii = _Rasterize.apply(
-        *fields.values(), poses, intrinsics, behind, screen_offsets, views
-    )
+    tensors, views = _inputs(gaussians, cameras, background, options)
+    finite, rgb, alpha, depth, radii = _Rasterize.apply(*tensors, screen_offsets, views)
     if not finite:
         check_values(gaussians)
         raise OptionError("a Gaussian's projection overflows float32: use backend='reference'")
@@ -106,6 +77,47 @@ def rasterize_native(
         screen_offsets,
         radii.view(*images, len(gaussians), 2),
     )
+
+
+def work(gaussians: Gaussians, cameras: Cameras) -> int:
+    """How many pairs of pixel and Gaussian the kernels compute for these images, for benchmarks."""
+    background = gaussians.means.new_zeros(len(cameras), 3)
+    options = RasterOptions(0.01, 1e10, 0.3, False, 0.999, None)
+    *_, state = _native.splat_forward(_scene(*_inputs(gaussians, cameras, background, options)))
+    return _native.splat_pairs(state)
+
+
+def _inputs(
+    gaussians: Gaussians, cameras: Cameras, background: Tensor, options: RasterOptions
+) -> tuple[list[Tensor], _Views]:
+    """Tensors in the order of `_INPUTS`, without the offsets, as the kernels read them."""
+    images = background.shape[:-1]
+    colors = gaussians.colors if gaussians.sh is None else gaussians.sh.flatten(-2)
+    assert colors is not None
+    tensors = [
+        *(
+            _frames(field, 2, images[:-1])
+            for field in (gaussians.means, gaussians.quaternions, gaussians.scales)
+        ),
+        _frames(gaussians.opacities, 1, images[:-1]),
+        _frames(colors, 2, images[:-1]),
+        cameras.world_to_camera.expand(*images, 4, 4).reshape(-1, 4, 4).contiguous(),
+        cameras.intrinsics.expand(*images, 3, 3).reshape(-1, 3, 3).contiguous(),
+        background.reshape(-1, background.shape[-1]).contiguous(),
+    ]
+    views = _Views(
+        0 if gaussians.sh is None else gaussians.sh.shape[-2],
+        len(cameras),
+        cameras.width,
+        cameras.height,
+        options.near,
+        min(options.far, 3e38),
+        options.eps2d,
+        options.max_alpha,
+        options.antialiased,
+        options.depth is not None,
+    )
+    return tensors, views
 
 
 def _frames(field: Tensor, dimensions: int, batch: torch.Size) -> Tensor:

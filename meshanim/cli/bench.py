@@ -8,6 +8,7 @@ from meshanim.attention.benchmark import BenchmarkOptions
 from meshanim.cli.demo import CLIP
 from meshanim.gaussians.binding_benchmark import BindingBenchmark
 from meshanim.gaussians.loss_benchmark import LossBenchmark
+from meshanim.gaussians.splat.benchmark import SplatBenchmark
 from meshanim.results import Results
 from meshanim.solve_benchmark import SolveBenchmark
 
@@ -49,6 +50,12 @@ def _solve(options: SolveBenchmark) -> None:
         _report(solve_benchmark.run(options, clip), options.json)
 
 
+def _splat(options: SplatBenchmark) -> None:
+    from meshanim.gaussians.splat import benchmark
+
+    _report(benchmark.run(options), options.json)
+
+
 def _report(results: Results, path: Path | None) -> None:
     print(results.table())
     print(", ".join(f"{key} {value}" for key, value in results.machine.items()))
@@ -62,4 +69,5 @@ COMMANDS = {
     "binding": _binding,
     "image-loss": _image_loss,
     "solve": _solve,
+    "splat": _splat,
 }

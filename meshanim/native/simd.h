@@ -125,6 +125,32 @@ inline void transpose(Floats (&rows)[LANES]) {
     }
 }
 
+// out[i] is quad i of a, repeated.
+inline void spread_quads(Floats a, Floats (&out)[LANES / 4]) {
+    out[0] = _mm512_shuffle_f32x4(a, a, 0x00), out[1] = _mm512_shuffle_f32x4(a, a, 0x55);
+    out[2] = _mm512_shuffle_f32x4(a, a, 0xaa), out[3] = _mm512_shuffle_f32x4(a, a, 0xff);
+}
+// Quad i of vector j becomes quad j of vector i.
+inline void transpose_quads(Floats (&v)[LANES / 4]) {
+    const Floats a = _mm512_shuffle_f32x4(v[0], v[1], 0x44), b = _mm512_shuffle_f32x4(v[0], v[1], 0xee);
+    const Floats c = _mm512_shuffle_f32x4(v[2], v[3], 0x44), d = _mm512_shuffle_f32x4(v[2], v[3], 0xee);
+    v[0] = _mm512_shuffle_f32x4(a, c, 0x88), v[1] = _mm512_shuffle_f32x4(a, c, 0xdd);
+    v[2] = _mm512_shuffle_f32x4(b, d, 0x88), v[3] = _mm512_shuffle_f32x4(b, d, 0xdd);
+}
+
+// Lane i of out[j] is the sum of lanes 4 j to 4 j + 3 of rows[i].
+inline void quad_sums(const Floats (&rows)[LANES], Floats (&out)[LANES / 4]) {
+    Floats quads[4];
+    for (int i = 0; i < 4; ++i) {
+        const Floats *r = rows + 4 * i;
+        const __m512d x = _mm512_castps_pd(_mm512_unpacklo_ps(r[0], r[1]) + _mm512_unpackhi_ps(r[0], r[1]));
+        const __m512d y = _mm512_castps_pd(_mm512_unpacklo_ps(r[2], r[3]) + _mm512_unpackhi_ps(r[2], r[3]));
+        quads[i] = _mm512_castpd_ps(_mm512_unpacklo_pd(x, y)) + _mm512_castpd_ps(_mm512_unpackhi_pd(x, y));
+    }
+    transpose_quads(quads);
+    for (int j = 0; j < 4; ++j) out[j] = quads[j];
+}
+
 #elif defined(__AVX2__)
 
 constexpr int LANES = 8;
@@ -221,6 +247,26 @@ inline void transpose(Floats (&rows)[LANES]) {
         rows[i] = _mm256_permute2f128_ps(quads[i], quads[4 + i], 0x20);
         rows[4 + i] = _mm256_permute2f128_ps(quads[i], quads[4 + i], 0x31);
     }
+}
+
+inline void spread_quads(Floats a, Floats (&out)[LANES / 4]) {
+    out[0] = _mm256_permute2f128_ps(a, a, 0x00), out[1] = _mm256_permute2f128_ps(a, a, 0x11);
+}
+inline void transpose_quads(Floats (&v)[LANES / 4]) {
+    const Floats a = v[0];
+    v[0] = _mm256_permute2f128_ps(a, v[1], 0x20);
+    v[1] = _mm256_permute2f128_ps(a, v[1], 0x31);
+}
+inline void quad_sums(const Floats (&rows)[LANES], Floats (&out)[LANES / 4]) {
+    Floats quads[2];
+    for (int i = 0; i < 2; ++i) {
+        const Floats *r = rows + 4 * i;
+        const __m256d x = _mm256_castps_pd(_mm256_unpacklo_ps(r[0], r[1]) + _mm256_unpackhi_ps(r[0], r[1]));
+        const __m256d y = _mm256_castps_pd(_mm256_unpacklo_ps(r[2], r[3]) + _mm256_unpackhi_ps(r[2], r[3]));
+        quads[i] = _mm256_castpd_ps(_mm256_unpacklo_pd(x, y)) + _mm256_castpd_ps(_mm256_unpackhi_pd(x, y));
+    }
+    transpose_quads(quads);
+    out[0] = quads[0], out[1] = quads[1];
 }
 
 #else
@@ -330,6 +376,9 @@ inline void transpose(Floats (&rows)[LANES]) {
     for (int i = 0; i < LANES; ++i)
         for (int j = 0; j < i; ++j) std::swap(rows[i].lane[j], rows[j].lane[i]);
 }
+inline void spread_quads(Floats a, Floats (&out)[LANES / 4]) { out[0] = a; }
+inline void transpose_quads(Floats (&)[LANES / 4]) {}
+inline void quad_sums(const Floats (&rows)[LANES], Floats (&out)[LANES / 4]) { out[0] = sums(rows); }
 
 #endif
 
@@ -343,11 +392,6 @@ inline Floats fold_sum(Floats a, int period) {
 inline Floats fold_maximum(Floats a, int period) {
     for (int distance = LANES / 2; distance >= period; distance /= 2) a = maximum(a, rotate(a, distance));
     return a;
-}
-// Sums of the quads: lane i of out[j] is the sum of lanes 4 j to 4 j + 3 of rows[i].
-inline void quad_sums(Floats (&rows)[LANES], Floats (&out)[LANES / 4]) {
-    transpose(rows);
-    for (int j = 0; j < LANES / 4; ++j) out[j] = (rows[4 * j] + rows[4 * j + 1]) + (rows[4 * j + 2] + rows[4 * j + 3]);
 }
 inline float sum(Floats a) {
     float lanes[LANES];

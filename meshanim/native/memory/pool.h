@@ -62,6 +62,7 @@ inline void let_reclaim(const Block &block) {
 class Pool {
    public:
     Block take(size_t size) {
+        size = (size + GRAIN - 1) / GRAIN * GRAIN;
         const std::lock_guard<std::mutex> guard(mutex_);
         auto best = idle_.end();
         for (auto it = idle_.begin(); it != idle_.end(); ++it)
@@ -73,7 +74,7 @@ class Pool {
             idle_.erase(best);
             idle_bytes_ -= block.size;
         } else {
-            block = map((size + GRAIN - 1) / GRAIN * GRAIN);
+            block = map(size);
         }
         used_bytes_ += block.size;
         most_used_ = std::max(most_used_, used_bytes_);

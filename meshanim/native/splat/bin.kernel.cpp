@@ -90,16 +90,32 @@ void splat_fill(const Scene &scene, const Key *keys, int64_t count, const Rectan
                 const splat::Bins &out) {
     const int parts = int(count / 4096 + 1 < scene.threads ? count / 4096 + 1 : scene.threads);
     const int64_t tiles = scene.tiles(), columns = scene.columns(), of_image = columns * scene.rows();
+    const uint32_t gaussians = uint32_t(scene.gaussians);
+    const bool several = scene.images() > 1;
     std::memset(counts, 0, sizeof(int32_t) * size_t(parts * tiles));
+    auto first_tile = [&](uint32_t item, Rectangle box) {
+        return (several ? int64_t(item / gaussians) * of_image : 0) + box.y0 * columns + box.x0;
+    };
+    // Most boxes are of at most two by two tiles, and which of the four is a coin toss: all four are counted, those
+    // that are not there by nought, and written, those that are not there to `nowhere`.
+    auto small = [](Rectangle box) { return box.x1 - box.x0 <= 2 && box.y1 - box.y0 <= 2; };
 #pragma omp parallel for num_threads(parts) schedule(static, 1)
     for (int part = 0; part < parts; ++part) {
         const Range range(count, part, parts);
         int32_t *const of_part = counts + part * tiles;
         for (int64_t i = range.begin; i < range.end; ++i) {
             const Rectangle box = rectangles[keys[i].item];
-            int32_t *const of_tile = of_part + keys[i].item / scene.gaussians * of_image;
-            for (int y = box.y0; y < box.y1; ++y)
-                for (int x = box.x0; x < box.x1; ++x) ++of_tile[y * columns + x];
+            int32_t *const tile = of_part + first_tile(keys[i].item, box);
+            if (small(box)) {
+                const int wide = box.x1 - box.x0 - 1, high = box.y1 - box.y0 - 1;
+                tile[0] += 1;
+                tile[wide] += wide;
+                tile[high * columns] += high;
+                tile[high * columns + wide] += wide & high;
+                continue;
+            }
+            for (int y = 0; y < box.y1 - box.y0; ++y)
+                for (int x = 0; x < box.x1 - box.x0; ++x) ++tile[y * columns + x];
         }
     }
     prefix(counts, tiles, parts, out.tiles);
@@ -107,13 +123,27 @@ void splat_fill(const Scene &scene, const Key *keys, int64_t count, const Rectan
     for (int part = 0; part < parts; ++part) {
         const Range range(count, part, parts);
         int32_t *const of_part = counts + part * tiles;
+        Entry nowhere;
         for (int64_t i = range.begin; i < range.end; ++i) {
             const uint32_t item = keys[i].item;
             const Rectangle box = rectangles[item];
-            int32_t *const of_tile = of_part + item / scene.gaussians * of_image;
+            int32_t *const tile = of_part + first_tile(item, box);
             uint32_t slot = uint32_t(out.slots[item]);
-            for (int y = box.y0; y < box.y1; ++y)
-                for (int x = box.x0; x < box.x1; ++x) out.entries[of_tile[y * columns + x]++] = {item, slot++};
+            if (small(box)) {
+                const int wide = box.x1 - box.x0 - 1, high = box.y1 - box.y0 - 1;
+                auto write = [&](int32_t &place, int there) {
+                    Entry *const entry = there ? out.entries + place : &nowhere;
+                    *entry = {item, slot};
+                    place += there, slot += uint32_t(there);
+                };
+                write(tile[0], 1);
+                write(tile[wide], wide);
+                write(tile[high * columns], high);
+                write(tile[high * columns + wide], wide & high);
+                continue;
+            }
+            for (int y = 0; y < box.y1 - box.y0; ++y)
+                for (int x = 0; x < box.x1 - box.x0; ++x) out.entries[tile[y * columns + x]++] = {item, slot++};
         }
     }
 }

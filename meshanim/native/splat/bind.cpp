@@ -29,6 +29,8 @@ MESHANIM_DECLARE(void splat_blend(const splat::Scene &, const splat::Forward &))
 MESHANIM_DECLARE(int64_t splat_scratch(int64_t entries))
 MESHANIM_DECLARE(void splat_blend_backward(const splat::Scene &, const splat::Backward &))
 MESHANIM_DECLARE(void splat_project_backward(const splat::Scene &, const splat::ParameterGradients &))
+MESHANIM_DECLARE(double fused_multiply_adds(int64_t rounds, int threads, float *out))
+MESHANIM_DECLARE(int pixels_of_block())
 
 namespace {
 
@@ -78,6 +80,12 @@ struct State {
     int32_t *used = nullptr;
     Arena of_items, of_entries;
 };
+
+const State &state_of(const Token &token) {
+    const State &state = *reinterpret_cast<const State *>(token.data());
+    require(state.magic == State::MAGIC, "splat: this is not a state");
+    return state;
+}
 
 struct SceneArrays {
     Rows<3> means;
@@ -166,6 +174,7 @@ bool render(const Scene &scene, State &state, float *planes, int32_t *radii) {
     const int64_t visible = accumulate(projected.chunk_items, tasks);
     state.entries = accumulate(projected.chunk_entries, tasks);
     require(state.entries < int64_t(std::numeric_limits<int32_t>::max()), "splat: the Gaussians cover too many tiles; render fewer images at once");
+    state.bins.count = state.entries;
     state.of_entries.reserve(state.bins.entries, state.entries);
     state.of_entries.reserve(state.masks, state.entries + 16);
     state.of_entries.allocate();
@@ -213,8 +222,8 @@ float *data_of(const Target &target, int64_t size) {
 void backward(const SceneHandle &handle, Token token, Gradient<4> rgb, Gradient<3> alpha, Gradient<3> depth, Target means,
               Target quaternions, Target scales, Target opacities, Target colors, Target offsets, Target background, Target poses) {
     const Scene &scene = handle.scene;
-    const State &state = *reinterpret_cast<const State *>(token.data());
-    require(state.magic == State::MAGIC && state.items == scene.items() && state.tiles == scene.tiles(), "splat: this is not the state of that scene");
+    const State &state = state_of(token);
+    require(state.items == scene.items() && state.tiles == scene.tiles(), "splat: this is not the state of that scene");
     auto fits = [&](const auto &gradient) {
         return !gradient || (int64_t(gradient->shape(0)) == scene.images() && int64_t(gradient->shape(1)) == scene.height &&
                              int64_t(gradient->shape(2)) == scene.width);
@@ -247,7 +256,7 @@ void backward(const SceneHandle &handle, Token token, Gradient<4> rgb, Gradient<
     }
     in.scratch_floats = MESHANIM_DISPATCH(splat_scratch, state.longest);
     scratch.reserve(in.scratch, in.scratch_floats * scene.threads);
-    scratch.reserve(in.background, state.tiles * scene.channels);
+    if (to_background) scratch.reserve(in.background, state.tiles * scene.channels);
     if (to_poses) scratch.reserve(out.poses, scene.images() * scene.chunks() * 12);
     scratch.allocate();
     for (in.group = 0; in.group < int(channels.size()); ++in.group) {
@@ -273,6 +282,16 @@ void backward(const SceneHandle &handle, Token token, Gradient<4> rgb, Gradient<
     }
 }
 
+// Pixels, visible or not, for which a Gaussian's alpha was computed: whole blocks.
+int64_t pairs(Token token) {
+    const State &state = state_of(token);
+    int64_t blocks = 0;
+    for (int64_t tile = 0; tile < state.tiles; ++tile)
+        for (int64_t i = 0; i < state.used[tile]; ++i)
+            for (uint64_t mask = state.masks[state.bins.tiles[tile] + i]; mask; mask &= mask - 1) ++blocks;
+    return blocks * MESHANIM_DISPATCH(pixels_of_block);
+}
+
 }  // namespace
 
 void bind_splat(nb::module_ &m) {
@@ -285,6 +304,11 @@ void bind_splat(nb::module_ &m) {
              "antialiased"_a, "depth"_a, "threads"_a);
     m.def("splat_forward", &forward, "scene"_a,
           "(finite, planes (images, channels [+ depth] + alpha, height, width), radii (images, N, 2), state).");
+    m.def("splat_pairs", &pairs, "state"_a.noconvert(), "How many pairs of pixel and Gaussian were computed.");
+    m.def("fused_multiply_adds", [](int64_t rounds, int threads) {
+        std::vector<float> sums(size_t(std::max(threads, 1)));
+        return MESHANIM_DISPATCH(fused_multiply_adds, rounds, std::max(threads, 1), sums.data());
+    }, "rounds"_a, "threads"_a, "Keep the processor busy in registers; returns the operations done, to be timed.");
     m.def("splat_backward", &backward, "scene"_a, "state"_a.noconvert(), "rgb"_a.none(), "alpha"_a.none(), "depth"_a.none(),
           "means"_a.none(), "quaternions"_a.none(), "scales"_a.none(), "opacities"_a.none(), "colors"_a.none(), "offsets"_a.none(),
           "background"_a.none(), "poses"_a.none(), "Gradients of the images to those of the parameters, written into what is given.");

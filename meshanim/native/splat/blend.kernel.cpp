@@ -46,33 +46,38 @@ void blend_block(const Block &block, int index, const float *local, const int32_
     state.open[index] = open;
 }
 
+// A plane of a tile from its blocks, a vector of a row of pixels at a time.
+template <class Value>
+void write_plane(const Scene &scene, const Tile &tile, float *plane, Value value) {
+    constexpr int QUADS = LANES / 4;
+    for (int row = 0; row < BLOCK_ROWS; ++row) {
+        const int top = row * BLOCK_HEIGHT, rows = tile.height - top < BLOCK_HEIGHT ? tile.height - top : BLOCK_HEIGHT;
+        for (int column = 0; column < BLOCK_COLUMNS; column += QUADS) {
+            const int left = column * BLOCK_WIDTH, columns = tile.width - left < LANES ? tile.width - left : LANES;
+            if (columns <= 0) break;
+            Floats blocks[QUADS];
+            for (int j = 0; j < QUADS; ++j) blocks[j] = value(row * BLOCK_COLUMNS + column + j);
+            simd::transpose_quads(blocks);
+            float *out = plane + int64_t(tile.y + top) * scene.width + tile.x + left;
+            for (int j = 0; j < rows; ++j, out += scene.width) {
+                if (columns == LANES) simd::store(out, blocks[j]);
+                else simd::store_first(out, blocks[j], columns);
+            }
+        }
+    }
+}
+
 template <int CHANNELS>
 void write_tile(const Scene &scene, const Tile &tile, int group, const State<CHANNELS> &state, float *planes) {
     const int64_t area = int64_t(scene.width) * scene.height;
     float *const image = planes + tile.image * (scene.blended() + 1) * area;
-    const float *background = scene.background + tile.image * scene.channels;
-    for (int b = 0; b < BLOCKS; ++b) {
-        const Block &block = block_at(b);
-        const int rows = tile.height - block.row < BLOCK_HEIGHT ? tile.height - block.row : BLOCK_HEIGHT;
-        const int columns = tile.width - block.column < BLOCK_WIDTH ? tile.width - block.column : BLOCK_WIDTH;
-        if (rows <= 0 || columns <= 0) continue;
-        const int64_t corner = int64_t(tile.y + block.row) * scene.width + tile.x + block.column;
-        auto write = [&](Floats value, int64_t plane) {
-            float lanes[LANES];
-            simd::store(lanes, value);
-            float *out = image + plane * area + corner;
-            for (int row = 0; row < rows; ++row, out += scene.width) {
-                if (columns == BLOCK_WIDTH) std::memcpy(out, lanes + row * BLOCK_WIDTH, BLOCK_WIDTH * sizeof(float));
-                else std::memcpy(out, lanes + row * BLOCK_WIDTH, size_t(columns) * sizeof(float));
-            }
-        };
-        for (int j = 0; j < CHANNELS; ++j) {
-            const int64_t channel = int64_t(group) * splat::GROUP + j;
-            const float behind = channel < scene.channels ? background[channel] : 0.0f;
-            write(fma(state.light[b], broadcast(behind), state.color[j][b]), channel);
-        }
-        if (group == 0) write(broadcast(1.0f) - state.light[b], scene.blended());
+    for (int j = 0; j < CHANNELS; ++j) {
+        const int64_t channel = int64_t(group) * splat::GROUP + j;
+        const Floats behind = broadcast(channel < scene.channels ? scene.background[tile.image * scene.channels + channel] : 0.0f);
+        write_plane(scene, tile, image + channel * area, [&](int b) { return fma(state.light[b], behind, state.color[j][b]); });
     }
+    if (group == 0)
+        write_plane(scene, tile, image + scene.blended() * area, [&](int b) { return broadcast(1.0f) - state.light[b]; });
 }
 
 template <int CHANNELS>
@@ -95,7 +100,7 @@ void blend_tile(const Scene &scene, const Forward &out, int64_t index, int group
     for (; first < end && any; first += BATCH) {
         const int count = int(end - first < BATCH ? end - first : BATCH);
         uint64_t masks[BATCH];
-        load_entries<true>(scene, tile, out.records, out.bins.entries + first, count, group, local, masks);
+        load_entries<true>(scene, tile, out.records, out.bins.entries + first, count, out.bins.count - first, group, local, masks, nullptr);
         if (group == 0) std::memcpy(out.masks + first, masks, sizeof(uint64_t) * size_t(count));
         list_blocks(masks, count, lists, BATCH + LANES, counts);
         any = false;

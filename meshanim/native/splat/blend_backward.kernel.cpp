@@ -1,9 +1,9 @@
-// The derivative of blending, a tile at a time and in it a block at a time, in three passes over the block's list:
+// The derivative of blending, a tile at a time and in it a block at a time, in two passes over the block's list:
 //   near to far: alphas and weights again, kept;
 //   far to near: with B the colour behind (dotted with the image gradient g), d L / d ln alpha = weight (g.c - B) and
-//     B <- B + alpha (g.c - B), without the division by 1 - alpha that a pass the other way would need;
-//   any order: sums over the block's pixels. Quads of pixels are broadcast against vectors that hold LANES / 4
-//     quantities each, so that no lanes are summed until the tile is done.
+//     B <- B + alpha (g.c - B), without the division by 1 - alpha that a pass the other way would need. Sums over the
+//     block's pixels: quads of them are spread against vectors of LANES / 4 quantities each, so that no lanes are
+//     summed until the tile is done.
 #include <cstring>
 
 #ifdef _OPENMP
@@ -28,16 +28,17 @@ template <int CHANNELS> constexpr int VECTORS = MOMENT_VECTORS + (CHANNELS + QUA
 
 // A thread's memory for a tile of up to `entries` entries.
 struct Scratch {
-    float *local, *pairs, *sums;
+    float *local, *shapes, *pairs, *sums;
     int32_t *lists;
     int64_t stride;
 
     static int64_t floats(int64_t entries) {
-        return (entries + LANES) * (RECORD + 2 * LANES + VECTORS<splat::GROUP> * LANES + BLOCKS);
+        return (entries + LANES) * (RECORD + SHAPE + 2 * LANES + VECTORS<splat::GROUP> * LANES + BLOCKS);
     }
     Scratch(float *memory, int64_t entries) : stride(entries + LANES) {
         local = memory;
-        pairs = local + stride * RECORD;
+        shapes = local + stride * RECORD;
+        pairs = shapes + stride * SHAPE;
         sums = pairs + stride * 2 * LANES;
         lists = reinterpret_cast<int32_t *>(sums + stride * VECTORS<splat::GROUP> * LANES);
     }
@@ -48,6 +49,10 @@ Floats load_gradient(const ImageGradient &gradient, const Tile &tile, const Bloc
     const float *corner = gradient.data + tile.image * gradient.image + (tile.y + block.row) * gradient.y +
                           (tile.x + block.column) * gradient.x + channel * gradient.channel;
     float lanes[LANES] = {};
+    if (tile.whole() && gradient.x == 1) {
+        for (int row = 0; row < BLOCK_HEIGHT; ++row) std::memcpy(lanes + row * BLOCK_WIDTH, corner + row * gradient.y, BLOCK_WIDTH * sizeof(float));
+        return simd::load(lanes);
+    }
     for (int l = 0; l < LANES; ++l) {
         const int row = l / BLOCK_WIDTH, column = l % BLOCK_WIDTH;
         if (block.row + row < tile.height && block.column + column < tile.width) lanes[l] = corner[row * gradient.y + column * gradient.x];
@@ -82,10 +87,10 @@ class TileGradient {
     void run() {
         const int64_t total = in_.bins.tiles[index_ + 1] - begin_;
         for (int64_t i = count_; i < total; ++i) std::memset(slot(i), 0, WIDTH * sizeof(float));
-        float *const background = in_.background + index_ * scene_.channels;
         Floats through[CHANNELS];
         for (int j = 0; j < CHANNELS; ++j) through[j] = broadcast(0.0f);
-        load_entries<false>(scene_, tile_, in_.records, in_.bins.entries + begin_, count_, in_.group, scratch_.local, nullptr);
+        load_entries<false>(scene_, tile_, in_.records, in_.bins.entries + begin_, count_, in_.bins.count - begin_, in_.group, scratch_.local, nullptr,
+                            scratch_.shapes);
         std::memset(scratch_.sums, 0, sizeof(float) * size_t(count_ * VECTORS<CHANNELS> * LANES));
         int32_t counts[BLOCKS];
         list_blocks(in_.masks + begin_, int(count_), scratch_.lists, scratch_.stride, counts);
@@ -93,18 +98,19 @@ class TileGradient {
         for (int64_t first = 0; first < count_; first += LANES) finish(first);
         for (int j = 0; j < CHANNELS; ++j) {
             const int64_t channel = int64_t(in_.group) * splat::GROUP + j;
-            if (channel < scene_.channels) background[channel] = simd::sum(through[j]);
+            if (in_.background && channel < scene_.channels)
+                in_.background[index_ * scene_.channels + channel] = simd::sum(through[j]);
         }
     }
 
    private:
-    static constexpr int WIDTH = MOMENTS + CHANNELS;
+    static constexpr int WIDTH = MOMENTS + CHANNELS, COLOR_VECTORS = VECTORS<CHANNELS> - MOMENT_VECTORS;
 
     float *slot(int64_t i) const { return in_.slots + int64_t(in_.bins.entries[begin_ + i].slot) * WIDTH; }
 
     void block(int index, int count, Floats (&through)[CHANNELS]) {
         const Block &block = block_at(index);
-        if (block.row >= tile_.height || block.column >= tile_.width) return;
+        if (block.row >= tile_.height || block.column >= tile_.width || (count == 0 && !in_.background)) return;
         Floats gradient[CHANNELS];
         Floats behind = in_.group == 0 ? broadcast(0.0f) - load_gradient(in_.alpha, tile_, block, 0) : broadcast(0.0f);
         for (int j = 0; j < CHANNELS; ++j) {
@@ -116,8 +122,7 @@ class TileGradient {
         const int32_t *list = scratch_.lists + index * scratch_.stride;
         const Floats light = near_to_far(block, list, count);
         for (int j = 0; j < CHANNELS; ++j) through[j] = fma(gradient[j], light, through[j]);
-        far_to_near(list, count, gradient, behind);
-        add(index, list, count, gradient);
+        far_to_near(index, list, count, gradient, behind);
     }
 
     // Keeps (alpha, weight) of each pair, zero where nothing was blended; cuts the list where no pixel takes more.
@@ -143,50 +148,49 @@ class TileGradient {
         return light;
     }
 
-    // Turns alpha into d L / d ln alpha, which is zero where max_alpha acts.
-    void far_to_near(const int32_t *list, int count, const Floats (&gradient)[CHANNELS], Floats behind) {
+    // d L / d ln alpha of every pixel, zero where max_alpha acts, and at once its sums and those of the colours.
+    void far_to_near(int index, const int32_t *list, int count, const Floats (&gradient)[CHANNELS], Floats behind) {
+        static const Basis basis;
+        Floats shape[MOMENT_VECTORS][QUADS], paint[COLOR_VECTORS][QUADS];
+        for (int m = 0; m < MOMENT_VECTORS; ++m)
+            for (int row = 0; row < QUADS; ++row) shape[m][row] = simd::load(basis.weights[index][m][row]);
+        for (int m = 0; m < COLOR_VECTORS; ++m) {
+            for (int j = 0; j < QUADS; ++j) paint[m][j] = m * QUADS + j < CHANNELS ? gradient[m * QUADS + j] : broadcast(0.0f);
+            simd::transpose_quads(paint[m]);
+        }
         const Floats most = broadcast(scene_.max_alpha);
         for (int i = count - 1; i >= 0; --i) {
-            const float *e = scratch_.local + list[i];
-            float *pair = scratch_.pairs + int64_t(i) * 2 * LANES;
+            const float *e = scratch_.local + list[i], *pair = scratch_.pairs + int64_t(i) * 2 * LANES;
             Floats color = broadcast(e[splat::COLOR]) * gradient[0];
             for (int j = 1; j < CHANNELS; ++j) color = fma(broadcast(e[splat::COLOR + j]), gradient[j], color);
             const Floats alpha = simd::load(pair), weight = simd::load(pair + LANES), rise = color - behind;
             behind = fma(alpha, rise, behind);
-            simd::store(pair, simd::keep(simd::greater(most, alpha), weight * rise));
-        }
-    }
-
-    void add(int index, const int32_t *list, int count, const Floats (&gradient)[CHANNELS]) {
-        static const Basis basis;
-        Floats shape[MOMENT_VECTORS][QUADS], paint[VECTORS<CHANNELS> - MOMENT_VECTORS][QUADS];
-        for (int m = 0; m < MOMENT_VECTORS; ++m)
-            for (int row = 0; row < QUADS; ++row) shape[m][row] = simd::load(basis.weights[index][m][row]);
-        float channels[(VECTORS<CHANNELS> - MOMENT_VECTORS) * QUADS][LANES] = {};
-        for (int j = 0; j < CHANNELS; ++j) simd::store(channels[j], gradient[j]);
-        for (int m = 0; m < VECTORS<CHANNELS> - MOMENT_VECTORS; ++m)
-            for (int row = 0; row < QUADS; ++row) {
-                float lanes[LANES];
-                for (int quad = 0; quad < QUADS; ++quad) std::memcpy(lanes + 4 * quad, channels[m * QUADS + quad] + 4 * row, 4 * sizeof(float));
-                paint[m][row] = simd::load(lanes);
-            }
-        for (int i = 0; i < count; ++i) {
-            const float *pair = scratch_.pairs + int64_t(i) * 2 * LANES;
+            Floats change[QUADS], part[QUADS];
+            simd::spread_quads(simd::keep(simd::greater(most, alpha), weight * rise), change);
+            for (int row = 0; row < QUADS; ++row) part[row] = simd::load_quad(pair + LANES + 4 * row);
             float *const sums = scratch_.sums + int64_t(list[i]) / RECORD * (VECTORS<CHANNELS> * LANES);
-            Floats sum[VECTORS<CHANNELS>];
-            for (int m = 0; m < VECTORS<CHANNELS>; ++m) sum[m] = simd::load(sums + m * LANES);
-            for (int row = 0; row < QUADS; ++row) {
-                const Floats change = simd::load_quad(pair + 4 * row), weight = simd::load_quad(pair + LANES + 4 * row);
-                for (int m = 0; m < MOMENT_VECTORS; ++m) sum[m] = fma(change, shape[m][row], sum[m]);
-                for (int m = MOMENT_VECTORS; m < VECTORS<CHANNELS>; ++m) sum[m] = fma(weight, paint[m - MOMENT_VECTORS][row], sum[m]);
+            for (int m = 0; m < MOMENT_VECTORS; ++m) {
+                Floats sum = simd::load(sums + m * LANES);
+                for (int row = 0; row < QUADS; ++row) sum = fma(change[row], shape[m][row], sum);
+                simd::store(sums + m * LANES, sum);
             }
-            for (int m = 0; m < VECTORS<CHANNELS>; ++m) simd::store(sums + m * LANES, sum[m]);
+            for (int m = 0; m < COLOR_VECTORS; ++m) {
+                Floats sum = simd::load(sums + (MOMENT_VECTORS + m) * LANES);
+                for (int row = 0; row < QUADS; ++row) sum = fma(part[row], paint[m][row], sum);
+                simd::store(sums + (MOMENT_VECTORS + m) * LANES, sum);
+            }
         }
     }
 
     // Moments of LANES entries about the tile's centre become moments of (p, q); writes them to their slots.
     void finish(int64_t first) {
         const int count = int(count_ - first < LANES ? count_ - first : LANES);
+#ifdef __GNUC__
+        for (int64_t i = first + LANES; i < first + 2 * LANES && i < count_; ++i) {
+            __builtin_prefetch(slot(i), 1);
+            __builtin_prefetch(slot(i) + WIDTH - 1, 1);
+        }
+#endif
         Floats m[MOMENT_VECTORS * QUADS], values[WIDTH];
         auto quantities = [&](int vector, Floats *out) {
             Floats rows[LANES], sums[QUADS];
@@ -197,11 +201,9 @@ class TileGradient {
         for (int k = 0; k < MOMENT_VECTORS; ++k) quantities(k, m + k * QUADS);
         Floats colors[(VECTORS<CHANNELS> - MOMENT_VECTORS) * QUADS];
         for (int k = MOMENT_VECTORS; k < VECTORS<CHANNELS>; ++k) quantities(k, colors + (k - MOMENT_VECTORS) * QUADS);
-        const float *rows[LANES];
-        for (int l = 0; l < LANES; ++l) rows[l] = scratch_.local + (first + (l < count ? l : 0)) * RECORD;
-        Floats f[FIELDS];
-        load_fields(rows, f);
-        const Floats p = f[P], q = f[Q], a = f[splat::A], b = f[splat::B], c = f[splat::C], two = broadcast(2.0f);
+        const float *shape = scratch_.shapes + first * SHAPE;
+        const Floats p = simd::load(shape), q = simd::load(shape + LANES), a = simd::load(shape + 2 * LANES);
+        const Floats b = simd::load(shape + 3 * LANES), c = simd::load(shape + 4 * LANES), two = broadcast(2.0f);
         const Floats across = fma(a, m[1], b * m[2]);                         // sum of a u + b v
         const Floats mixed = fma(a, m[4], b * m[5]);                          // of (a u + b v) v
         const Floats square = fma(a, fma(a, m[3], two * b * m[4]), b * b * m[5]);

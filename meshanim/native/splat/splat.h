@@ -83,6 +83,7 @@ struct Bins {
     int32_t *slots;             // (items + 1,) where each item's slots begin
     int32_t *tiles;             // (tiles + 1,) where each tile's entries begin
     Entry *entries;
+    int64_t count;              // of entries
 };
 
 struct Forward {
@@ -107,7 +108,7 @@ struct Backward {
     int group, channels;        // which channels: `channels` of them from group * GROUP on
     ImageGradient rgb, alpha, depths;
     float *slots;               // (entries, MOMENTS + channels)
-    float *background;          // (tiles, channels), partial sums
+    float *background;          // (tiles, channels), partial sums; null if not wanted
     float *scratch;             // a thread's is `scratch_floats` long
     int64_t scratch_floats;
 };

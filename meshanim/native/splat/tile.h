@@ -28,6 +28,8 @@ using splat::TILE;
 constexpr int BLOCK_WIDTH = 4, BLOCK_HEIGHT = LANES / 4;
 constexpr int BLOCK_COLUMNS = TILE / BLOCK_WIDTH, BLOCK_ROWS = TILE / BLOCK_HEIGHT, BLOCKS = BLOCK_COLUMNS * BLOCK_ROWS;
 constexpr int FIELDS = 8;   // of a record, up to its colours
+constexpr int PREFETCH = 48;   // entries ahead
+constexpr int SHAPE = 5;    // P, Q, A, B, C
 enum Local { P = splat::X, Q = splat::Y };
 
 struct Tile {
@@ -75,11 +77,12 @@ inline const Block &block_at(int index) {
     return all.blocks[index];
 }
 
-// The first FIELDS of LANES records, a vector each.
-inline void load_fields(const float *const (&rows)[LANES], Floats (&fields)[FIELDS]) {
-    for (int part = 0; part < FIELDS; part += LANES) {
+// Copies LANES records and returns the first FIELDS, a vector each.
+inline void copy_records(const float *const (&rows)[LANES], float *out, Floats (&fields)[FIELDS]) {
+    for (int part = 0; part < RECORD; part += LANES) {
         Floats loaded[LANES];
-        for (int l = 0; l < LANES; ++l) loaded[l] = simd::load(rows[l] + part);
+        for (int l = 0; l < LANES; ++l) loaded[l] = simd::load(rows[l] + part), simd::store(out + l * RECORD + part, loaded[l]);
+        if (part >= FIELDS) continue;
         simd::transpose(loaded);
         for (int j = 0; j < LANES && part + j < FIELDS; ++j) fields[part + j] = loaded[j];
     }
@@ -129,11 +132,12 @@ inline void block_masks(const Tile &tile, const Floats (&f)[FIELDS], uint64_t *m
     }
 }
 
-// Copies a tile's entries to local records, the colours of `group` among them, and finds their masks if wanted
-// (`local` and `masks` have room for a multiple of LANES).
+// Copies a tile's entries to local records, the colours of `group` among them. Finds their masks, or keeps their
+// shapes by vectors, SHAPE of them for LANES entries. All have room for a multiple of LANES. `ahead`: entries there
+// are from the first on, other tiles' included.
 template <bool MASKS>
 inline void load_entries(const splat::Scene &scene, const Tile &tile, const float *records, const splat::Entry *entries,
-                         int64_t count, int group, float *local, uint64_t *masks) {
+                         int64_t count, int64_t ahead, int group, float *local, uint64_t *masks, float *shapes) {
     const int64_t frame = tile.image / scene.cameras, base = tile.image * scene.gaussians;
     for (int64_t first = 0; first < count; first += LANES) {
         const float *rows[LANES];
@@ -141,19 +145,20 @@ inline void load_entries(const splat::Scene &scene, const Tile &tile, const floa
             const int64_t index = first + l < count ? first + l : count - 1;
             rows[l] = records + int64_t(entries[index].item) * RECORD;
 #ifdef __GNUC__
-            const int64_t ahead = first + l + 2 * LANES < count ? first + l + 2 * LANES : count - 1;
-            __builtin_prefetch(records + int64_t(entries[ahead].item) * RECORD);
+            const int64_t next = first + l + PREFETCH < ahead ? first + l + PREFETCH : index;
+            __builtin_prefetch(records + int64_t(entries[next].item) * RECORD);
 #endif
         }
         float *const out = local + first * RECORD;
-        for (int l = 0; l < LANES; ++l) std::memcpy(out + l * RECORD, rows[l], sizeof(float) * (splat::COLOR + splat::GROUP));
         Floats fields[FIELDS];
-        load_fields(rows, fields);
+        copy_records(rows, out, fields);
         if (MASKS) block_masks(tile, fields, masks + first);
         const Floats dx = broadcast(tile.centre_x) - fields[splat::X], dy = broadcast(tile.centre_y) - fields[splat::Y];
+        fields[P] = fma(fields[splat::A], dx, fields[splat::B] * dy), fields[Q] = fields[splat::C] * dy;
+        if (!MASKS)
+            for (int j = 0; j < SHAPE; ++j) simd::store(shapes + first * SHAPE + j * LANES, fields[j]);
         float p[LANES], q[LANES];
-        simd::store(p, fma(fields[splat::A], dx, fields[splat::B] * dy));
-        simd::store(q, fields[splat::C] * dy);
+        simd::store(p, fields[P]), simd::store(q, fields[Q]);
         for (int l = 0; l < LANES; ++l) out[l * RECORD + P] = p[l], out[l * RECORD + Q] = q[l];
         if (group == 0) continue;
         for (int l = 0; l < LANES; ++l) {
