@@ -167,7 +167,7 @@ class FitSettings:
 
 
 def _falling(start: float) -> Rate:
-    return Rate(start, end=0.03, level=0.3, delay=50, delay_factor=0.02)
+    return Rate(start, end=0.01, level=0.3, delay=50, delay_factor=0.02)
 
 
 SMALL_RATES = {
@@ -187,9 +187,9 @@ PRESETS = {
     "paper": FitSettings(),
     "small": FitSettings(
         iterations=5000,
-        color=ColorSettings(sh_degree=1, sh_every=0.0, latent=8),
+        color=ColorSettings(sh_degree=2, sh_every=0.0, latent=8),
         density=Density(
-            "top", start=0.1, stop=0.31, every=0.1, prune_opacity=0.02, reset_every=0.0, limit=21_800
+            "top", start=0.08, stop=0.49, every=0.08, prune_opacity=0.02, reset_every=0.0, limit=21_800
         ),
         regularizers=Regularizers(scale_weight=0.05, scale_threshold=0.8),
         scale=(0.5, 0.12, 0.5),

@@ -1,4 +1,6 @@
 import json
+from importlib.resources import files
+from pathlib import Path
 
 import pytest
 import torch
@@ -100,3 +102,13 @@ def test_damage_is_named(head, tmp_path):
         Avatar.from_pretrained(folder)
     with pytest.raises(OptionError, match="cannot have"):
         AvatarConfig(sh_degree=4)
+
+
+def test_the_avatar_that_ships_is_whole_and_small():
+    avatar = Avatar.from_pretrained("default")
+    assert avatar.config.name == "Bruno"
+    assert len(avatar) > 20_000
+    rows = [avatar.means, avatar.scales, avatar.rotations, avatar.opacities, avatar.sh0, avatar.latents]
+    assert all(torch.isfinite(values).all() for values in rows)
+    weights = Path(str(files("meshanim.gaussians.avatar"))) / "weights" / "default"
+    assert sum(path.stat().st_size for path in weights.iterdir()) < 2.4e6
