@@ -16,6 +16,7 @@ from meshanim.gaussians.cameras import Cameras
 from meshanim.gaussians.gaussians import Gaussians
 from meshanim.gaussians.splat.functional import rasterize
 from meshanim.gaussians.splat.native import work
+from meshanim.gaussians.splat.rendering import DepthMode
 from meshanim.results import Results
 
 __all__ = ["SplatBenchmark", "run", "workload"]
@@ -93,6 +94,7 @@ def workload(count: int, size: int, seed: int = 0) -> tuple[Gaussians, Cameras]:
 def _measure(options: SplatBenchmark, count: int, size: int, results: Results) -> None:
     scene, cameras = workload(count, size, options.seed)
     leaves = scene.map(lambda field: field.clone().requires_grad_())
+    assert leaves.colors is not None
     inputs = [leaves.means, leaves.quaternions, leaves.scales, leaves.opacities, leaves.colors]
     generator = torch.Generator().manual_seed(options.seed)
     towards = (
@@ -100,9 +102,8 @@ def _measure(options: SplatBenchmark, count: int, size: int, results: Results) -
         torch.randn(1, size, size, generator=generator),
     )
 
-    def forward(backend: str, depth: bool = False) -> Callable[[], object]:
-        mode = "expected" if depth else None
-        return torch.no_grad()(lambda: rasterize(scene, cameras, depth=mode, backend=backend))
+    def forward(backend: str, depth: DepthMode | None = None) -> Callable[[], object]:
+        return torch.no_grad()(lambda: rasterize(scene, cameras, depth=depth, backend=backend))
 
     def both(backend: str) -> Callable[[], object]:
         def step() -> tuple[Tensor, ...]:
@@ -113,7 +114,7 @@ def _measure(options: SplatBenchmark, count: int, size: int, results: Results) -
 
     runs = {
         ("native", "forward"): forward("native"),
-        ("native", "forward with depth"): forward("native", depth=True),
+        ("native", "forward with depth"): forward("native", depth="expected"),
         ("native", "forward + backward"): both("native"),
     }
     medians = _medians(runs, options.repeats)
