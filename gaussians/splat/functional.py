@@ -82,15 +82,7 @@ def rasterize(
     options = RasterOptions(near, far, eps2d, antialiased, max_alpha, depth)
     backend = _choose(backend, gaussians)
     _check_cameras(gaussians, cameras)
-    try:
-        batch = torch.broadcast_shapes(
-            gaussians.batch_shape, cameras.world_to_camera.shape[:-3], cameras.intrinsics.shape[:-3]
-        )
-    except RuntimeError as error:
-        raise ShapeError(
-            f"cameras {tuple(cameras.world_to_camera.shape)} do not fit the Gaussians' batch "
-            f"{tuple(gaussians.batch_shape)}"
-        ) from error
+    batch = _batch(gaussians, cameras)
     images = (*batch, len(cameras))
     if 0 in images:
         raise ShapeError(f"there is no image to render in a batch of {images}")
@@ -124,6 +116,18 @@ def _choose(backend: str, gaussians: Gaussians) -> str:
             "use backend='reference' or 'auto'"
         )
     return backend
+
+
+def _batch(gaussians: Gaussians, cameras: Cameras) -> torch.Size:
+    own = gaussians.batch_shape
+    if not own and cameras.world_to_camera.ndim == 3 == cameras.intrinsics.ndim:
+        return own
+    try:
+        return torch.broadcast_shapes(own, cameras.world_to_camera.shape[:-3], cameras.intrinsics.shape[:-3])
+    except RuntimeError as error:
+        raise ShapeError(
+            f"cameras {tuple(cameras.world_to_camera.shape)} do not fit the Gaussians' batch {tuple(own)}"
+        ) from error
 
 
 def _check_cameras(gaussians: Gaussians, cameras: Cameras) -> None:

@@ -180,7 +180,7 @@ _INPUTS = (
 
 def _scene(tensors: tuple[Tensor, ...] | list[Tensor], views: _Views):
     means, quaternions, scales, opacities, colors, poses, intrinsics, background = (
-        tensor.detach() for tensor in tensors
+        tensor.detach().numpy() for tensor in tensors
     )
     return _native.SplatScene(
         means,

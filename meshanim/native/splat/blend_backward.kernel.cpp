@@ -182,7 +182,8 @@ class TileGradient {
         }
     }
 
-    // Moments of LANES entries about the tile's centre become moments of (p, q); writes them to their slots.
+    // Moments of LANES entries about the tile's centre become moments of (p, q); writes them to their slots. What is
+    // read beyond the last entry goes nowhere.
     void finish(int64_t first) {
         const int count = int(count_ - first < LANES ? count_ - first : LANES);
 #ifdef __GNUC__
@@ -194,7 +195,7 @@ class TileGradient {
         Floats m[MOMENT_VECTORS * QUADS], values[WIDTH];
         auto quantities = [&](int vector, Floats *out) {
             Floats rows[LANES], sums[QUADS];
-            for (int l = 0; l < LANES; ++l) rows[l] = simd::load(scratch_.sums + (first + (l < count ? l : 0)) * (VECTORS<CHANNELS> * LANES) + vector * LANES);
+            for (int l = 0; l < LANES; ++l) rows[l] = simd::load(scratch_.sums + (first + l) * (VECTORS<CHANNELS> * LANES) + vector * LANES);
             simd::quad_sums(rows, sums);
             for (int j = 0; j < QUADS; ++j) out[j] = sums[j];
         };

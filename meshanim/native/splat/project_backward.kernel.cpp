@@ -16,7 +16,7 @@ using splat::Scene;
 
 // Gradients of LANES items: what their slots hold, summed.
 struct Sums {
-    float moments[MOMENTS][LANES], color[splat::GROUP + 1][LANES];   // of the first channels, and depth last
+    Floats moments[MOMENTS], color[splat::GROUP], depth;   // color: of spherical harmonics
 };
 
 class ChunkGradient {
@@ -50,40 +50,40 @@ class ChunkGradient {
             std::memset(data + row * field.frame + begin_ * width, 0, sizeof(float) * size_t((end_ - begin_) * width));
     }
 
-    // Returns which lanes have slots.
+    // Returns which lanes have slots. Gradients of plain colours are done with here.
     uint32_t gather(int64_t image, int64_t first, int count, Sums &sums) {
-        const int64_t base = image * scene_.gaussians + first, frame = image / scene_.cameras;
-        std::memset(&sums, 0, sizeof sums);
+        constexpr int PARTS = (MOMENTS + splat::GROUP + LANES - 1) / LANES;
+        const int64_t frame = image / scene_.cameras;
+        const int32_t *slots = out_.slots + image * scene_.gaussians + first;
         uint32_t seen = 0;
-        for (int l = 0; l < count; ++l) {
-            const int64_t begin = out_.slots[base + l], end = out_.slots[base + l + 1];
-            if (begin == end) {
-                if (out_.offsets) out_.offsets[2 * (base + l)] = out_.offsets[2 * (base + l) + 1] = 0;
-                continue;
-            }
-            seen |= 1u << l;
-            for (int group = 0; group < out_.n_groups; ++group) {
-                const int channels = out_.channels[group], width = MOMENTS + channels;
-                constexpr int PARTS = (MOMENTS + splat::GROUP + LANES - 1) / LANES;
-                Floats total[PARTS];
-                for (int part = 0; part < PARTS; ++part) total[part] = broadcast(0.0f);
-                const float *slot = out_.groups[group] + begin * width;
-                for (int64_t i = begin; i < end; ++i, slot += width)
-                    for (int part = 0; part < PARTS; ++part) {
-                        const int rest = width - part * LANES;
-                        if (rest > 0) total[part] += simd::load_first(slot + part * LANES, rest < LANES ? rest : LANES);
-                    }
-                float values[PARTS * LANES];
-                for (int part = 0; part < PARTS; ++part) simd::store(values + part * LANES, total[part]);
-                for (int j = 0; j < MOMENTS; ++j) sums.moments[j][l] += values[j];
-                for (int j = 0; j < channels; ++j) {
-                    const int64_t channel = int64_t(group) * splat::GROUP + j;
-                    if (channel == scene_.channels) sums.color[splat::GROUP][l] = values[MOMENTS + j];
-                    else if (scene_.coefficients) sums.color[channel][l] = values[MOMENTS + j];
-                    else if (out_.colors)
-                        out_.colors[frame * scene_.colors.frame + (first + l) * scene_.channels + channel] += values[MOMENTS + j];
+        for (int l = 0; l < count; ++l) seen |= uint32_t(slots[l] != slots[l + 1]) << l;
+        for (Floats &moment : sums.moments) moment = broadcast(0.0f);
+        for (Floats &color : sums.color) color = broadcast(0.0f);
+        sums.depth = broadcast(0.0f);
+        if (!seen) return 0;
+        for (int group = 0; group < out_.n_groups; ++group) {
+            const int channels = out_.channels[group], width = MOMENTS + channels;
+            Floats fields[PARTS * LANES];
+            for (int part = 0; part * LANES < width; ++part) {
+                const int rest = width - part * LANES < LANES ? width - part * LANES : LANES;
+                Floats rows[LANES];
+                for (int l = 0; l < LANES; ++l) {
+                    rows[l] = broadcast(0.0f);
+                    if (l >= count) continue;
+                    const float *slot = out_.groups[group] + int64_t(slots[l]) * width + part * LANES;
+                    for (int32_t i = slots[l]; i < slots[l + 1]; ++i, slot += width) rows[l] += simd::load_first(slot, rest);
                 }
+                simd::transpose(rows);
+                for (int j = 0; j < LANES; ++j) fields[part * LANES + j] = rows[j];
             }
+            for (int j = 0; j < MOMENTS; ++j) sums.moments[j] += fields[j];
+            const int64_t channel = int64_t(group) * splat::GROUP;
+            const int colors = scene_.channels - channel < channels ? int(scene_.channels - channel) : channels;
+            if (colors < channels) sums.depth = fields[MOMENTS + colors];
+            if (scene_.coefficients)
+                for (int j = 0; j < colors; ++j) sums.color[j] = fields[MOMENTS + j];
+            else if (out_.colors)
+                add(out_.colors + frame * scene_.colors.frame + first * scene_.channels + channel, fields + MOMENTS, colors, scene_.channels, seen, count);
         }
         return seen;
     }
@@ -93,6 +93,7 @@ class ChunkGradient {
         const int64_t frame = image / scene_.cameras, base = image * scene_.gaussians + first;
         Sums sums;
         const uint32_t seen = gather(image, first, count, sums);
+        if (out_.offsets) std::memset(out_.offsets + 2 * base, 0, 2 * sizeof(float) * size_t(count));
         if (!seen) return;
         float lit[LANES];
         for (int l = 0; l < LANES; ++l) lit[l] = seen >> l & 1 ? 1.0f : 0.0f;
@@ -100,13 +101,12 @@ class ChunkGradient {
         const Inputs in = load_inputs(scene_, frame, first, count);
         const Ellipse e(view, scene_, in);
         const Floats zero = broadcast(0.0f), eps = broadcast(scene_.eps2d);
-        Floats g[MOMENTS];   // sums of d L / d ln alpha times 1, p, q, p^2, p q, q^2
-        for (int j = 0; j < MOMENTS; ++j) g[j] = simd::load(sums.moments[j]);
+        const Floats *g = sums.moments;   // sums of d L / d ln alpha times 1, p, q, p^2, p q, q^2
 
         // d ln alpha / d (p, q) = -(p, q) / KAPPA; p = A dx + B dy with dx = pixel - position.
         const Floats inverse_kappa = broadcast(1 / KAPPA);
         Floats position[2] = {inverse_kappa * e.a * g[1], inverse_kappa * fma(e.b, g[1], e.c * g[2])};
-        if (out_.offsets) scatter<2>(out_.offsets + 2 * base, position, seen, count, false);
+        if (out_.offsets) add(out_.offsets + 2 * base, position, 2, 2, seen, count);
 
         // Rows of L M, L = (A B; 0 C) whitening: again by Lagrange, without cancellation.
         // (m1.m1 + eps) m0 - (m0.m1) m1 = eps m0 + m1 x (m0 x m1), and the Gaussian's scale is a factor of each column.
@@ -145,7 +145,7 @@ class ChunkGradient {
         // row = focal / z (R_i - slope_i R_z); position = focal ratio + centre.
         const float *r = view.rotation;
         const Floats focal[2] = {broadcast(view.fx), broadcast(view.fy)};
-        Floats camera[3], inverse_z = zero, depth = simd::load(sums.color[splat::GROUP]);
+        Floats camera[3], inverse_z = zero, depth = sums.depth;
         for (int i = 0; i < 2; ++i) {
             const float low = i ? view.low_y : view.low_x, high = i ? view.high_y : view.high_x;
             const simd::Mask free = simd::both(simd::at_least(e.ratio[i], broadcast(low)), simd::at_least(broadcast(high), e.ratio[i]));
@@ -207,8 +207,9 @@ class ChunkGradient {
         const Floats inverse = broadcast(1.0f) / simd::square_root(dot(d, d));
         for (int j = 0; j < 3; ++j) unit[j] = d[j] * inverse;
         harmonics(scene_.coefficients, unit[0], unit[1], unit[2], basis);
-        float values[16][LANES], changes[16][LANES] = {};
+        float values[16][LANES], changes[16][LANES] = {}, gradients[3][LANES];
         for (int k = 0; k < scene_.coefficients; ++k) simd::store(values[k], basis[k]);
+        for (int j = 0; j < 3; ++j) simd::store(gradients[j], sums.color[j]);
         const int64_t width = 3 * scene_.coefficients;
         const float *rows = at(scene_.colors, frame, first, width);
         for (int l = 0; l < count; ++l) {
@@ -218,7 +219,7 @@ class ChunkGradient {
             for (int j = 0; j < 3; ++j) {
                 float color = 0.5f;
                 for (int k = 0; k < scene_.coefficients; ++k) color += values[k][l] * row[3 * k + j];
-                const float gradient = color > 0 ? sums.color[j][l] : 0.0f;   // clamped at zero
+                const float gradient = color > 0 ? gradients[j][l] : 0.0f;   // clamped at zero
                 for (int k = 0; k < scene_.coefficients; ++k) {
                     changes[k][l] += gradient * row[3 * k + j];
                     if (out) out[3 * k + j] += gradient * values[k][l];
@@ -249,18 +250,18 @@ class ChunkGradient {
         for (int j = 0; j < 12; ++j) total_[j] += simd::sum(simd::keep(visible, pose_[j]));
     }
 
-    template <int WIDTH>
-    static void scatter(float *rows, const Floats *columns, uint32_t seen, int count, bool add) {
-        float values[WIDTH][LANES];
-        for (int j = 0; j < WIDTH; ++j) simd::store(values[j], columns[j]);
+    // Columns added to the rows of the lanes that are seen, `stride` floats apart.
+    static void add(float *rows, const Floats *columns, int width, int64_t stride, uint32_t seen, int count) {
+        float values[4][LANES];
+        for (int j = 0; j < width; ++j) simd::store(values[j], columns[j]);
         for (int l = 0; l < count; ++l)
             if (seen >> l & 1)
-                for (int j = 0; j < WIDTH; ++j) rows[l * WIDTH + j] = add ? rows[l * WIDTH + j] + values[j][l] : values[j][l];
+                for (int j = 0; j < width; ++j) rows[l * stride + j] += values[j][l];
     }
 
     template <int WIDTH>
     void write(float *data, const splat::Field &field, const Floats *columns, int64_t frame, int64_t first, uint32_t seen, int count) {
-        if (data) scatter<WIDTH>(data + frame * field.frame + first * WIDTH, columns, seen, count, true);
+        if (data) add(data + frame * field.frame + first * WIDTH, columns, WIDTH, WIDTH, seen, count);
     }
 
     const Scene &scene_;
