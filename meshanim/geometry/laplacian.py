@@ -69,7 +69,8 @@ def eigenbasis(
         In 1/m², ascending; zero once for each component of the mesh.
     eigenvectors : (V, k) float
         Orthonormal in the mass: `vectors.T @ mass @ vectors` is the identity. The entry of largest
-        magnitude of each is positive.
+        magnitude of each is positive. Where eigenvalues repeat, as on symmetric meshes, rounding chooses the
+        basis of their space, and with it the number of threads.
 
     Raises
     ------

@@ -218,8 +218,9 @@ def test_features_made_ahead_are_those_that_training_makes(corpus, tmp_path, mon
     found = load_clips(dataset, names, ahead, ("anna", "ben"), ("neutral", "joy"), 1, False)
     assert {path.name: path.stat().st_mtime_ns for path in made.glob("*.npy")} == written
     for one, other in zip(own, found):
-        assert all(np.array_equal(a[:], b[:]) for a, b in zip(one.features, other.features))
-        assert all(np.array_equal(a[:], b[:]) for a, b in zip(one.mels, other.mels))
+        for a, b in zip([*one.features, *one.mels], [*other.features, *other.mels]):
+            # Workers have one thread each, which may round to a neighbour among the numbers of 16 bits.
+            np.testing.assert_allclose(a[:], b[:], rtol=2**-9, atol=1e-3)
     with pytest.raises(OptionError, match="no split"):
         cache_features(CacheFeaturesOptions(corpus, split="trian"), progress=False)
 
