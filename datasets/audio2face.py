@@ -36,24 +36,11 @@ from meshanim.datasets.motion_dataset import (
 from meshanim.datasets.point_caches import find_cache, read_points
 from meshanim.errors import FileFormatError, OptionError
 from meshanim.geometry import TriangleMesh
+from meshanim.motion.emotions import EMOTIONS
 from meshanim.motion.face_parts import FaceParts
 
-__all__ = ["EMOTIONS", "Audio2FaceDataset", "Audio2FaceOptions"]
+__all__ = ["Audio2FaceDataset", "Audio2FaceOptions"]
 
-EMOTIONS = (
-    "neutral",
-    "amazement",
-    "anger",
-    "cheekiness",
-    "disgust",
-    "fear",
-    "grief",
-    "joy",
-    "outofbreath",
-    "pain",
-    "sadness",
-)
-"""The eleven emotional states of the published data."""
 LANGUAGES = {"english": "en", "mandarin": "zh", "chinese": "zh"}
 UPPER_FACE = 0.6
 """Share of the face's height above which skin is upper face: the published mask level."""

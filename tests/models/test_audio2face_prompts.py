@@ -13,7 +13,7 @@ from meshanim.models.audio2face.prompts import (
     prompts,
     text_track,
 )
-from meshanim.models.audio2face.speech import EMOTIONS
+from meshanim.motion.emotions import EMOTIONS
 
 transformers = pytest.importorskip("transformers")
 

@@ -14,7 +14,6 @@ from meshanim.audio import SpeechEncoder, Waveform
 from meshanim.errors import OptionError, ShapeError
 
 __all__ = [
-    "EMOTIONS",
     "EmotionTrack",
     "FeatureReader",
     "Hearing",
@@ -26,19 +25,6 @@ __all__ = [
 RATE = 16000
 Hearing = Literal["speech", "window"]
 """Whether features come from the whole speech, or from each window of sound alone."""
-EMOTIONS = (
-    "amazement",
-    "anger",
-    "cheekiness",
-    "disgust",
-    "fear",
-    "grief",
-    "joy",
-    "outofbreath",
-    "pain",
-    "sadness",
-)
-"""Audio2Face-3D's emotions (Sec. 3.1) but neutral, which is none of them."""
 
 
 def features_at(
