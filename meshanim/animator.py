@@ -1,71 +1,34 @@
 """`Animator`: speech to an animated head, whole files and streams through one path."""
 
+import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import soxr
 import torch
-from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
 from jaxtyping import Float, Float32
 from tqdm import tqdm
-from tyro.conf import arg
 
 from meshanim.audio import SpeechEncoder, Waveform, load_encoder, load_waveform
-from meshanim.audio.encoders import MelEncoder
-from meshanim.audio.features import frame_count
-from meshanim.errors import FileFormatError, OptionError
+from meshanim.errors import FileFormatError, OptionError, ShapeError
 from meshanim.geometry import TriangleMesh
 from meshanim.geometry.correspondence import surface_correspondence
 from meshanim.heads import Head, load_head
 from meshanim.models.gava import Gava
-from meshanim.models.gava_stream import GavaStream
+from meshanim.models.loading import load_network
 from meshanim.motion import MeshSequence
+from meshanim.motion.animation_state import FacePose, posed_face
 from meshanim.motion.idle import IdleMotion
 from meshanim.motion.lip_seal import LipSeal, head_lip_seal
+from meshanim.performance import AnimationOptions, Network, Performance, perform
 
 __all__ = ["AnimationOptions", "AnimationStream", "Animator", "Frames"]
 
 Template = Float[np.ndarray, "vertices 3"]
 CHECKPOINTS = {"default": "gava-default"}
-
-
-@dataclass(frozen=True)
-class AnimationOptions:
-    """How a speech is performed.
-
-    Parameters
-    ----------
-    fps : float, optional
-        Frames a second; those of the checkpoint if not given.
-    subject : str, optional
-        Whose speaking style, one of the checkpoint's training subjects; their mean if not given.
-    emotion : str
-        One of the checkpoint's emotions.
-    intensity : float
-        Of the emotion, 0 to 1.
-    seed : int
-        Of blinks, gaze and sway.
-    blinks : float
-        Blinks a second that are added, on heads that have ARKit's eye shapes; 0 for none.
-    gaze, sway : float
-        Gains on added shifts of gaze and on the added slow movement of the head; 0 for none.
-    seal : bool
-        Whether lips are closed where the encoder hears p, b or m, on heads that name lip pairs.
-    """
-
-    fps: float | None = None
-    subject: Annotated[str | None, arg(aliases=["--style"])] = None
-    emotion: str = "neutral"
-    intensity: float = 1.0
-    seed: int = 0
-    blinks: float = 0.28
-    gaze: float = 1.0
-    sway: float = 1.0
-    seal: bool = True
 
 
 class Frames(NamedTuple):
@@ -83,26 +46,13 @@ class AnimationStream:
     """
 
     def __init__(self, animator: "Animator", rate: int, options: AnimationOptions, template: Template | None):
-        encoder = animator.encoder
         self._animator, self.rate = animator, rate
-        self._resample = (
-            None
-            if rate == encoder.sample_rate
-            else soxr.ResampleStream(rate, encoder.sample_rate, 1, "float32")
-        )
-        self._features = encoder.stream()
-        self._mel = animator.mel.stream() if animator.model.config.pose else None
-        model = animator.model
-        seal = animator.lip_seal() if options.seal else None
-        self._frames = GavaStream(
-            model,
-            template=None if template is None else torch.from_numpy(np.asarray(template, np.float32)),
-            style=model.style_of(options.subject, options.emotion, options.intensity),
-            fps=options.fps,
-            seal=seal,
-            bilabial=animator.bilabial if seal is not None else None,
-        )
-        self.fps = self._frames.fps
+        wanted = animator.encoder.sample_rate
+        self._resample = soxr.ResampleStream(rate, wanted, 1, "float32") if rate != wanted else None
+        self._performance = animator.perform(options, template)
+        self._parts = None if isinstance(animator.model, Gava) else animator.model.actors.basis.parts
+        self.fps = self._performance.fps
+        self._template = template
         self._idle = IdleMotion(options.seed, options.blinks, options.gaze, options.sway)
         self._given = 0
         self._samples = 0
@@ -133,31 +83,39 @@ class AnimationStream:
     def _advance(self, samples: np.ndarray, last: bool) -> Frames:
         if self._resample is not None:
             samples = self._resample.resample_chunk(samples, last=last)
-        features = [self._features.push(samples)]
-        mel = [] if self._mel is None else [self._mel.push(samples)]
-        if last:
-            features.append(self._features.finish())
-            if self._mel is not None:
-                mel.append(self._mel.finish())
-        given = self._frames.push(torch.cat(features), torch.cat(mel) if mel else None)
-        parts = [given]
-        if last:
-            total = frame_count(Waveform(np.zeros(max(1, self._samples), np.float32), self.rate), self.fps)
-            parts.append(self._frames.finish(total))
-        vertices, pose = (torch.cat(arrays).numpy() for arrays in zip(*parts, strict=True))
+        motion = self._performance.push(samples, self._total() if last else None)
+        pose = motion.pose.cpu().numpy()
         times = (self._given + np.arange(len(pose)) + 0.5) / self.fps
         self._given += len(pose)
         pose = pose + self._idle.pose(times)
         weights = self._idle.weights(times, pose)
-        return Frames(self._animator.finished(vertices, weights), pose.astype(np.float32))
+        face = motion.face
+        if isinstance(face, FacePose):
+            assert self._parts is not None
+            face = posed_face(self._parts, face, self._performance.template)
+        vertices = self._animator.finished(face.cpu().numpy(), weights, self._template)
+        return Frames(vertices, pose.astype(np.float32))
+
+    @property
+    def mesh(self) -> TriangleMesh:
+        """The animated head at rest, as who speaks."""
+        if self._animator.correspondence is not None:
+            on_target = self._animator.is_on_target(self._template)
+            return self._animator.mesh.with_vertices(self._template) if on_target else self._animator.mesh
+        if self._template is None and isinstance(self._animator.model, Gava):
+            return self._animator.mesh
+        return self._animator.mesh.with_vertices(self._performance.template.cpu().numpy())
+
+    def _total(self) -> int:
+        return max(1, math.ceil(self._samples * self.fps / self.rate - 1e-9))
 
 
 class Animator:
-    """A model, the encoder it listens through, and the head it moves.
+    """A network, the encoder it listens through, and the head it moves.
 
     Parameters
     ----------
-    model : Gava
+    model : Gava, Audio2FaceRegression or Audio2FaceDiffusion
         The network.
     encoder : SpeechEncoder
         Must have the feature width that the network reads.
@@ -174,7 +132,11 @@ class Animator:
     """
 
     def __init__(
-        self, model: Gava, encoder: SpeechEncoder, model_head: Head | None = None, head: Head | None = None
+        self,
+        model: Network,
+        encoder: SpeechEncoder,
+        model_head: Head | None = None,
+        head: Head | None = None,
     ):
         if encoder.dim != model.config.feature_dim:
             raise OptionError(
@@ -182,18 +144,17 @@ class Animator:
                 f"{model.config.feature_dim}: it was trained with {model.config.encoder}"
             )
         self.network = model.eval()
-        views = [model.on(k) for k in range(model.n_topologies)]
-        self.model = views[0]
+        self.views = [model.on(k) for k in range(model.n_topologies)] if isinstance(model, Gava) else [model]
+        self.model = self.views[0]
         self.encoder = encoder
-        self.mel = MelEncoder()
         self.model_head = model_head
         self.head = model_head if head is None else head
         self.correspondence = None
         if head is not None:
-            own = next((view for view in views if _same_faces(head.mesh, view.mesh)), None)
+            own = next((view for view in self.views if _same_faces(head.mesh, view)), None)
             if own is None:
                 self.correspondence = surface_correspondence(self.model.mesh, head.mesh)
-            elif own is not self.model:
+            elif own is not self.model or model_head is None:
                 self.model, self.model_head = own, head
 
     @classmethod
@@ -205,7 +166,7 @@ class Animator:
         Parameters
         ----------
         name : str or Path
-            "default", a folder that `meshanim train gava` wrote, or a repository of the Hugging Face hub.
+            "default", a folder that `meshanim train` wrote, or a repository of the Hugging Face hub.
         head : str or Head, optional
             The head to animate, as `load_head` takes it; the checkpoint's own if not given.
         device : str
@@ -221,12 +182,7 @@ class Animator:
             path = Path(name)
         elif not path.is_dir():
             raise FileFormatError(f"the checkpoint '{name}' is missing from the installation: install again")
-        try:
-            model = Gava.from_pretrained(path).to(device)
-        except (HfHubHTTPError, LocalEntryNotFoundError, HFValidationError) as error:
-            raise FileFormatError(
-                f"no checkpoint {name}: neither a folder here nor a repository of the hub that can be reached"
-            ) from error
+        model = load_network(path, device)
         model_head = load_head(model.config.head) if model.config.head else None
         own = head is None or head == model.config.head
         target = None if own else load_head(head) if isinstance(head, str) else head
@@ -246,6 +202,17 @@ class Animator:
         """The seal of the network's head; None where the head names no lip pairs or the encoder no class."""
         return None if self.bilabial is None else head_lip_seal(self.model_head)
 
+    def perform(self, options: AnimationOptions, template: Template | None = None) -> Performance:
+        """Start the network on a speech at the encoder's rate; arguments as of `open`."""
+        rest = None
+        if template is not None and not self.is_on_target(template):
+            rest = torch.from_numpy(np.asarray(template, np.float32))
+        elif self.correspondence is not None and not isinstance(self.model, Gava):
+            # Moves are carried over from the face that the correspondence was found on.
+            rest = torch.from_numpy(self.model.mesh.vertices.astype(np.float32))
+        seal = self.lip_seal() if options.seal and isinstance(self.model, Gava) else None
+        return perform(self.model, self.encoder, options, rest, self.model_head, seal)
+
     def open(
         self, rate: int = 16000, options: AnimationOptions | None = None, template: Template | None = None
     ) -> AnimationStream:
@@ -258,19 +225,41 @@ class Animator:
         options : AnimationOptions, optional
             How it is performed.
         template : (V, 3), optional
-            Who speaks: the face at rest, metres, in one of the network's topologies; its own if not given.
+            Who speaks: the face at rest, metres, in one of the network's topologies or in that of the
+            animated head; its own if not given.
+
+        Raises
+        ------
+        OptionError
+            If the rate is not positive or an option does not fit the network.
+        ShapeError
+            If no topology of the network has the template's number of vertices.
         """
+        if not rate > 0:
+            raise OptionError(f"rate must be positive, not {rate}")
         return AnimationStream(self.on_template(template), rate, options or AnimationOptions(), template)
 
+    def is_on_target(self, template: Template | None) -> bool:
+        """Whether a template is of the head that motion is carried over to, not of the network's."""
+        if template is None or self.correspondence is None or len(template) == self.model.n_vertices:
+            return False
+        return len(template) == self.mesh.n_vertices
+
     def on_template(self, template: Template | None) -> "Animator":
-        """The animator of the topology that has a template's number of vertices; this one if none has."""
-        if template is None or len(template) == self.model.n_vertices:
+        """The animator of the topology that has a template's number of vertices.
+
+        Raises
+        ------
+        ShapeError
+            If there is none.
+        """
+        if template is None or len(template) == self.model.n_vertices or self.is_on_target(template):
             return self
-        for k in range(self.network.n_topologies):
-            view = self.network.on(k)
-            if view.n_vertices == len(template):
-                return Animator(view, self.encoder, load_head(view.config.head) if view.config.head else None)
-        return self
+        view = next((view for view in self.views if view.n_vertices == len(template)), None)
+        if view is None:
+            counts = " or ".join(str(view.n_vertices) for view in self.views)
+            raise ShapeError(f"the template has {len(template)} vertices, the network's face {counts}")
+        return Animator(view, self.encoder, load_head(view.config.head) if view.config.head else None)
 
     def stream(
         self,
@@ -305,7 +294,8 @@ class Animator:
         options : AnimationOptions, optional
             How it is performed.
         template : (V, 3), optional
-            Who speaks: the face at rest, metres, in one of the network's topologies; its own if not given.
+            Who speaks: the face at rest, metres, in one of the network's topologies or in that of the
+            animated head; its own if not given.
         progress : bool
             Whether to show a bar, in seconds of sound.
 
@@ -328,12 +318,11 @@ class Animator:
         parts.append(stream.finish())
         vertices = np.concatenate([part.vertices for part in parts])
         pose = np.concatenate([part.pose for part in parts])
-        mesh = self.mesh
-        if template is not None and self.correspondence is None:
-            mesh = mesh.with_vertices(template)
-        return MeshSequence(vertices, stream.fps, mesh, pose, waveform)
+        return MeshSequence(vertices, stream.fps, stream.mesh, pose, waveform)
 
-    def finished(self, vertices: np.ndarray, weights) -> Float32[np.ndarray, "frames vertices 3"]:
+    def finished(
+        self, vertices: np.ndarray, weights, template: Template | None = None
+    ) -> Float32[np.ndarray, "frames vertices 3"]:
         """Add eye weights where the head has those shapes, and carry the frames over to another head."""
         head = self.model_head
         if head is not None and len(vertices) and "eyeBlinkLeft" in head.expression_names:
@@ -343,8 +332,15 @@ class Animator:
             vertices = vertices + moved.numpy()
         if self.correspondence is None:
             return vertices
-        return self.correspondence.carry_displacements(vertices).astype(np.float32)
+        carried = self.correspondence.carry_displacements(vertices).astype(np.float32)
+        if template is None or not self.is_on_target(template):
+            return carried
+        return carried + (np.asarray(template, np.float32) - self.mesh.vertices.astype(np.float32))
 
 
-def _same_faces(one: TriangleMesh, other: TriangleMesh) -> bool:
-    return one.n_vertices == other.n_vertices and np.array_equal(one.faces, other.faces)
+def _same_faces(mesh: TriangleMesh, network: Network) -> bool:
+    if mesh.n_vertices != network.n_vertices:
+        return False
+    # Networks of data without faces take those of any mesh with as many vertices.
+    unknown = not isinstance(network, Gava) and not len(network.actors.faces)
+    return unknown or np.array_equal(mesh.faces, network.mesh.faces)

@@ -38,7 +38,8 @@ class AnimateOptions:
     model: str = "default"
     """Checkpoint: default, a folder that `meshanim train` wrote, or a repository of the hub."""
     head: str = "default"
-    """Head to animate: default, flame:/path/generic_model.pkl or rig:/path/face.glb."""
+    """Head to animate: default, flame:/path/generic_model.pkl, rig:/path/face.glb, or own: the mesh that the
+    network was trained on."""
     person: str = "ana"
     """Who, on the default head: one of the twelve people that `docs/look.md` shows."""
     skin: Path | None = None
@@ -85,7 +86,7 @@ def announce(output: Path, sequence: MeshSequence) -> None:
 def perform(options: AnimateOptions) -> tuple["Scene", MeshSequence]:
     """What is drawn, and how it moves."""
     speech = load_waveform(options.speech, rate=None)
-    animator = Animator.from_pretrained(options.model, options.head)
+    animator = Animator.from_pretrained(options.model, None if options.head == "own" else options.head)
     scene = Scene(animator, options)
     sequence = animator(speech, options.performance, scene.template, progress=sys.stderr.isatty())
     return scene, sequence

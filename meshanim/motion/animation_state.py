@@ -24,6 +24,8 @@ __all__ = [
     "StateBasis",
     "eye_angles",
     "eye_rotation",
+    "face_pose",
+    "posed_face",
     "read_actors",
     "write_actors",
 ]
@@ -58,6 +60,52 @@ def eye_angles(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 2
     gaze = rotation[..., :, 2]
     pitch = torch.asin((-gaze[..., 1]).clamp(-1, 1))
     return torch.stack([pitch, torch.atan2(gaze[..., 0], gaze[..., 2])], dim=-1)
+
+
+def face_pose(
+    parts: FaceParts, vertices: Float[Tensor, "frames vertices 3"], template: Float[Tensor, "vertices 3"]
+) -> FacePose:
+    """What vertices in the zero pose say: the displacements of each part, and how the eyeballs are turned.
+
+    Raises
+    ------
+    ShapeError
+        If the mesh has too few vertices.
+    """
+    if vertices.shape[1] <= parts.largest or vertices.shape[1:] != template.shape:
+        raise ShapeError(
+            f"frames have {vertices.shape[1]} vertices and the template {len(template)}; the face's parts "
+            f"name vertex {parts.largest}"
+        )
+    moved = vertices - template
+    jaw = moved.new_zeros(len(moved), 5, 3)
+    if len(parts.jaw_points):
+        jaw = moved[:, parts.jaw_points]
+    eyes = moved.new_zeros(len(moved), 2, 2)
+    for side, ball in enumerate((parts.right_eye, parts.left_eye)):
+        if len(ball) and len(moved):
+            eyes[:, side] = eye_angles(_rotation(template[ball], vertices[:, ball]))
+    return FacePose(moved[:, parts.skin], moved[:, parts.tongue], jaw, eyes)
+
+
+def posed_face(
+    parts: FaceParts, pose: FacePose, template: Float[Tensor, "vertices 3"]
+) -> Float[Tensor, "frames vertices 3"]:
+    """Vertices of a pose: skin and tongue moved, lower teeth and eyeballs carried rigidly."""
+    out = template.repeat(len(pose.skin), 1, 1)
+    if not len(out):
+        return out
+    out[:, parts.skin] += pose.skin
+    out[:, parts.tongue] += pose.tongue
+    if len(parts.jaw_points) and len(parts.jaw_rigid):
+        carried = template[parts.jaw_rigid].expand(len(out), -1, 3)
+        out[:, parts.jaw_rigid] = _jaw_transform(parts, pose.jaw, template).apply(carried)
+    for side, ball in enumerate((parts.right_eye, parts.left_eye)):
+        if len(ball):
+            centre = template[ball].mean(0)
+            rotation = eye_rotation(pose.eyes[:, side])
+            out[:, ball] = (template[ball] - centre) @ rotation.mT + centre
+    return out
 
 
 @dataclass(frozen=True)
@@ -201,8 +249,7 @@ class StateBasis:
         """
         if not self.sizes["jaw"]:
             raise MeshError("this mesh has no jaw points, so its jaw has no rigid motion")
-        neutral = template[self.parts.jaw_points].expand(len(jaw), 5, 3)
-        return align(neutral, neutral + jaw)
+        return _jaw_transform(self.parts, jaw, template)
 
     def vertices(
         self, states: Float[Tensor, "frames state"], template: Float[Tensor, "vertices 3"]
@@ -214,19 +261,7 @@ class StateBasis:
         self, pose: FacePose, template: Float[Tensor, "vertices 3"]
     ) -> Float[Tensor, "frames vertices 3"]:
         """As `vertices`, from what `decode` gives, or a network."""
-        parts = self.parts
-        out = template.repeat(len(pose.skin), 1, 1)
-        out[:, parts.skin] += pose.skin
-        out[:, parts.tongue] += pose.tongue
-        if self.sizes["jaw"] and len(parts.jaw_rigid):
-            carried = template[parts.jaw_rigid].expand(len(out), -1, 3)
-            out[:, parts.jaw_rigid] = self.jaw_transform(pose.jaw, template).apply(carried)
-        for side, ball in enumerate((parts.right_eye, parts.left_eye)):
-            if self.eyes and len(ball):
-                centre = template[ball].mean(0)
-                rotation = eye_rotation(pose.eyes[:, side])
-                out[:, ball] = (template[ball] - centre) @ rotation.mT + centre
-        return out
+        return posed_face(self.parts, pose, template)
 
     def to(self, *args) -> "StateBasis":
         """On another device or in another precision."""
@@ -294,6 +329,13 @@ def read_actors(path: str | Path) -> Actors:
         return Actors(basis, dict(sorted(templates.items())), tensors["faces"].numpy())
     except (OSError, SafetensorError, KeyError, ShapeError, MeshError) as error:
         raise FileFormatError(f"{path} is no basis of animation states: {error}") from error
+
+
+def _jaw_transform(
+    parts: FaceParts, jaw: Float[Tensor, "frames 5 3"], template: Float[Tensor, "vertices 3"]
+) -> Similarity:
+    neutral = template[parts.jaw_points].expand(len(jaw), 5, 3)
+    return align(neutral, neutral + jaw)
 
 
 def _rotation(

@@ -135,10 +135,19 @@ def evaluate_gava(options: EvaluateGavaOptions, progress: bool = True) -> Result
 
 
 def load_gava(name: str) -> Gava:
-    """A checkpoint by name or folder."""
+    """A checkpoint by name or folder.
+
+    Raises
+    ------
+    OptionError
+        If it is of another network.
+    """
     from meshanim.animator import Animator
 
-    return Animator.from_pretrained(name).network
+    network = Animator.from_pretrained(name).network
+    if not isinstance(network, Gava):
+        raise OptionError(f"{name} is a checkpoint of {network.title}, not of GAVA")
+    return network
 
 
 def topology_of(model: Gava, dataset: MeshanimDataset) -> Gava:

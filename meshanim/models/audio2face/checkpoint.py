@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import asdict
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -11,8 +12,9 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from meshanim.errors import FileFormatError, MeshanimError
+from meshanim.errors import FileFormatError, MeshanimError, OptionError
 from meshanim.files import written_whole
+from meshanim.geometry import TriangleMesh
 from meshanim.motion.animation_state import Actors, read_actors, write_actors
 
 __all__ = ["Checkpoint"]
@@ -37,6 +39,26 @@ class Checkpoint(nn.Module, PyTorchModelHubMixin):
     @property
     def device(self) -> torch.device:
         return next(self.parameters()).device
+
+    @property
+    def n_vertices(self) -> int:
+        return len(next(iter(self.actors.templates.values())))
+
+    @cached_property
+    def mesh(self) -> TriangleMesh:
+        """The first actor's neutral face.
+
+        Raises
+        ------
+        OptionError
+            If no faces are known.
+        """
+        if not len(self.actors.faces):
+            raise OptionError(
+                "this network knows vertices but no faces: prepare its data with --faces, or animate a head "
+                "with as many vertices"
+            )
+        return TriangleMesh(next(iter(self.actors.templates.values())).numpy(), self.actors.faces)
 
     def _save_pretrained(self, save_directory: Path) -> None:
         state = {name: tensor.detach().cpu().contiguous() for name, tensor in self.saved().items()}
