@@ -10,7 +10,7 @@ from meshanim.files import read_json
 from meshanim.gaussians.cameras import Cameras
 from meshanim.render.camera import Camera, look_at, portrait_camera
 
-__all__ = ["CAMERAS", "camera_path", "read_camera_path"]
+__all__ = ["CAMERAS", "camera_path", "read_camera_path", "still_camera"]
 
 CAMERAS = ("front", "orbit")
 SWING, NOD, PERIOD = np.radians(40.0), np.radians(8.0), 8.0
@@ -44,7 +44,7 @@ def camera_path(
     if name not in CAMERAS:
         raise OptionError(f"camera must be {', '.join(CAMERAS)} or a .json file, not {name!r}")
     if name == "front":
-        return _still(Cameras.of(portrait_camera(head, width, height)), frames)
+        return still_camera(portrait_camera(head, width, height), frames)
     phase = 2 * np.pi * np.arange(frames) / (PERIOD * fps)
     angles = np.stack([SWING * np.sin(phase), NOD * np.sin(2 * phase)], 1)
     views = [portrait_camera(head, width, height, azimuth, elevation) for azimuth, elevation in angles]
@@ -92,7 +92,7 @@ def read_camera_path(path: str | Path, frames: int) -> Cameras:
     except (ValueError, TypeError, AttributeError, MeshanimError) as error:
         raise FileFormatError(f"{path} holds no cameras: {error}") from error
     if len(cameras) == 1:
-        return _still(together, frames)
+        return still_camera(cameras[0], frames)
     if len(cameras) != frames:
         raise FileFormatError(
             f"{path} has {len(cameras)} cameras for {frames} frames: one or as many are needed; "
@@ -101,8 +101,10 @@ def read_camera_path(path: str | Path, frames: int) -> Cameras:
     return _one_a_frame(together)
 
 
-def _still(camera: Cameras, frames: int) -> Cameras:
-    pose, intrinsics = camera.world_to_camera, camera.intrinsics
+def still_camera(camera: Camera, frames: int) -> Cameras:
+    """One camera for so many frames, (T, 1, 4, 4)."""
+    seen = Cameras.of(camera)
+    pose, intrinsics = seen.world_to_camera, seen.intrinsics
     return Cameras(
         pose.expand(frames, *pose.shape),
         intrinsics.expand(frames, *intrinsics.shape),

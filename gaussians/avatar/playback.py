@@ -43,7 +43,7 @@ def play(
     avatar: Avatar,
     sequence: MeshSequence,
     cameras: Cameras,
-    background: Sequence[float] | None = None,
+    background: Sequence[float] | Float[np.ndarray, "height width 3"] | None = None,
 ) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
     """Draw an animation frame by frame, head pose included.
 
@@ -58,8 +58,8 @@ def play(
         What is played; of any identity, and any topology.
     cameras : Cameras
         (T, 1, 4, 4): one a frame.
-    background : (3,), optional
-        sRGB in [0, 1]; what the avatar was fitted in front of, if not given.
+    background : (3,) or (H, W, 3), optional
+        A colour or a picture, sRGB in [0, 1]; what the avatar was fitted in front of, if not given.
 
     Yields
     ------
@@ -68,8 +68,11 @@ def play(
     Raises
     ------
     ShapeError
-        If there are not as many cameras as frames.
+        If there are not as many cameras as frames, or the background has another size.
     """
+    size = (cameras.height, cameras.width, 3)
+    if background is not None and np.shape(background) not in ((3,), size):
+        raise ShapeError(f"background must be a colour or a picture {size}, not {np.shape(background)}")
     if cameras.world_to_camera.shape[:-2] != (len(sequence), 1):
         raise ShapeError(
             f"cameras must be ({len(sequence)}, 1, 4, 4), one a frame, not "
@@ -79,9 +82,15 @@ def play(
 
 
 def _draw(
-    avatar: Avatar, sequence: MeshSequence, cameras: Cameras, background: Sequence[float] | None
+    avatar: Avatar,
+    sequence: MeshSequence,
+    cameras: Cameras,
+    background: Sequence[float] | Float[np.ndarray, "height width 3"] | None,
 ) -> Iterator[np.ndarray]:
     like = avatar.means
+    behind = None
+    if np.ndim(background) == 3:
+        behind, background = torch.as_tensor(background).to(like), (0.0, 0.0, 0.0)
     cameras = cameras.to(like.device).to(like.dtype)
     vertices, template = on_avatar(avatar, sequence), avatar_template(avatar)
     solve = None
@@ -99,5 +108,8 @@ def _draw(
                 torch.from_numpy(sequence.pose[part]).to(like),
                 avatar.shape,
             )
-            pictures = avatar(posed, seen, background, parameters, depth=None).rgb[:, 0]
+            drawn = avatar(posed, seen, background, parameters, depth=None)
+            pictures = drawn.rgb[:, 0]
+            if behind is not None:
+                pictures = pictures + (1 - drawn.alpha[:, 0, ..., None]) * behind
         yield from (255 * pictures.clamp(0, 1)).round().to(torch.uint8).cpu().numpy()

@@ -17,8 +17,9 @@ from meshanim.errors import OptionError
 from meshanim.files import check_writable
 from meshanim.heads import DefaultHead
 from meshanim.motion import MeshSequence
+from meshanim.render import Camera
 
-__all__ = ["COMMANDS", "AnimateOptions", "Scene", "animate", "announce", "perform"]
+__all__ = ["COMMANDS", "AnimateOptions", "Scene", "animate", "announce", "check_size", "perform"]
 
 ENDINGS = (".mp4", ".glb", ".npz", ".png")
 
@@ -62,8 +63,7 @@ def animate(options: AnimateOptions) -> None:
     ending = options.output.suffix.lower()
     if ending not in ENDINGS:
         raise OptionError(f"cannot write {options.output}: the ending must be one of {', '.join(ENDINGS)}")
-    if options.size < 16 or options.size % 2:
-        raise OptionError(f"size must be even and at least 16, not {options.size}")
+    check_size(options.size)
     check_writable(options.output)
     scene, sequence = perform(options)
     if ending == ".npz":
@@ -75,6 +75,12 @@ def animate(options: AnimateOptions) -> None:
     else:
         scene.write_video(sequence)
     announce(options.output, sequence)
+
+
+def check_size(size: int) -> None:
+    """OptionError if pictures of a video cannot have so many pixels a side."""
+    if size < 16 or size % 2:
+        raise OptionError(f"size must be even and at least 16, not {size}")
 
 
 def announce(output: Path, sequence: MeshSequence) -> None:
@@ -131,14 +137,15 @@ class Scene:
     def _shape(self) -> torch.Tensor | None:
         return None if self.appearance is None else torch.from_numpy(self.appearance.shape)[None]
 
-    def frames(self, sequence: MeshSequence, size: int) -> Iterator[np.ndarray]:
+    def frames(self, sequence: MeshSequence, size: int, camera: Camera | None = None) -> Iterator[np.ndarray]:
+        """Pictures, `size` pixels a side, from the front if no camera is given."""
         from meshanim.render import portrait_camera, render_mesh, render_sequence
 
         head, quality = self.animator.head, self.options.quality
         if self.appearance is not None and isinstance(head, DefaultHead):
-            yield from render_sequence(sequence, head, self.appearance, size, size, quality)
+            yield from render_sequence(sequence, head, self.appearance, size, size, quality, camera=camera)
             return
-        camera = portrait_camera(sequence.mesh.vertices, size, size)
+        camera = camera or portrait_camera(sequence.mesh.vertices, size, size)
         for vertices in sequence.vertices if head is None else sequence.posed(head):
             yield render_mesh(vertices, sequence.mesh, camera, quality=quality)
 

@@ -12,7 +12,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from meshanim.animator import AnimationOptions, Animator
 from meshanim.audio import load_waveform
-from meshanim.cli.animate import announce
+from meshanim.cli.animate import announce, check_size
 from meshanim.errors import OptionError
 from meshanim.files import check_writable
 from meshanim.gaussians.avatar.evaluation import EvaluateAvatarOptions, evaluate_avatar
@@ -86,8 +86,7 @@ def write_pictures(output: Path, frames: Iterator[np.ndarray], sequence: MeshSeq
 def _check(options: RenderOptions) -> None:
     if options.output.suffix.lower() not in ENDINGS:
         raise OptionError(f"cannot write {options.output}: the ending must be one of {', '.join(ENDINGS)}")
-    if options.size < 16 or options.size % 2:
-        raise OptionError(f"size must be even and at least 16, not {options.size}")
+    check_size(options.size)
     if options.motion is None and options.audio is None:
         raise OptionError("what is to be played? give --motion FILE.npz or --audio FILE.wav")
     if options.background is not None and not all(0 <= value <= 1 for value in options.background):

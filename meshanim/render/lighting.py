@@ -15,6 +15,7 @@ __all__ = [
     "Lighting",
     "Quality",
     "backdrop",
+    "developed",
     "plain_background",
     "quality_named",
 ]
@@ -180,11 +181,20 @@ def quality_named(quality: "str | Quality") -> Quality:
     return named[quality]
 
 
+def developed(light: Float[np.ndarray, "*pixels 3"]) -> Float[np.ndarray, "*pixels 3"]:
+    """The sRGB in [0, 1] that linear light gets in a picture: the tone curve of `develop`."""
+    return np.minimum(_toned(light), 1.0) ** (1 / 2.2)
+
+
+def _toned(light: np.ndarray) -> np.ndarray:
+    return light * (1 + light / 9) / (1 + 0.62 * light) * 1.22
+
+
 def plain_background(width: int, height: int, color: Triple) -> Float[np.ndarray, "height width 3"]:
-    """Linear light that the tone curve of `develop` turns into one sRGB colour, in [0, 1]."""
+    """Linear light that `developed` turns into one sRGB colour, in [0, 1]."""
     wanted = np.array(color, np.float64) ** 2.2
     light = np.linspace(0, 16, 1 << 20)
-    light = np.interp(wanted, light * (1 + light / 9) / (1 + 0.62 * light) * 1.22, light)
+    light = np.interp(wanted, _toned(light), light)
     return np.broadcast_to(light.astype(np.float32), (height, width, 3)).copy()
 
 

@@ -17,6 +17,9 @@ from meshanim.gaussians.camera_paths import camera_path
 from meshanim.geometry import decimate
 from meshanim.heads import HeadParameters, load_head
 from meshanim.motion import MeshSequence
+from meshanim.render import head_camera
+from meshanim.render.lighting import backdrop, developed
+from meshanim.render.look import find_person, make_appearance
 
 
 @pytest.fixture(scope="module")
@@ -80,6 +83,11 @@ def test_pictures_are_those_of_the_posed_head(head, avatar):
     sequence = yawn(head)
     cameras = camera_path("front", avatar_template(avatar), 3, 10.0, 48, 48)
     frames = list(play(avatar, sequence, cameras, background=(0.0, 1.0, 0.0)))
+    painted = np.tile(np.float32([0, 1, 0]), (48, 48, 1))
+    for frame, again in zip(frames, play(avatar, sequence, cameras, painted)):
+        np.testing.assert_allclose(frame, again, atol=1)
+    with pytest.raises(ShapeError, match="a colour or a picture"):
+        play(avatar, sequence, cameras, painted[:40])
     assert [frame.shape for frame in frames] == [(48, 48, 3)] * 3
     assert frames[0][0, 0].tolist() == [0, 255, 0]
     parameters = HeadParameters(
@@ -138,15 +146,69 @@ def test_the_command_says_speech(folder, tmp_path):
         assert len(list(file.decode(video=0))) == 6
 
 
-def test_mesh_and_avatar_say_the_same_side_by_side(folder, tmp_path):
-    soundfile.write(tmp_path / "a.wav", np.zeros(2000), 16000)
-    options = AnimateOptions(tmp_path / "a.wav", tmp_path / "a.mp4", size=32, quality="draft")
-    side_by_side(options, str(folder))
-    with av.open(str(tmp_path / "a.mp4")) as file:
-        pictures = [frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)]
-    assert np.shape(pictures) == (4, 32, 64, 3)
-    assert np.ptp(pictures[0][:, :32], axis=(0, 1)).max() > 40
-    assert pictures[0][0, -1].tolist() == pytest.approx([0, 0, 255], abs=16)
+def extent(picture: np.ndarray, background: np.ndarray) -> np.ndarray:
+    """First row, first and last column of the head, at the height of the ears."""
+    away = np.abs(picture.astype(int) - background).max(-1) > 24
+    columns = np.flatnonzero(away[: len(away) // 2].any(0))
+    return np.array([np.flatnonzero(away.any(1))[0], columns[0], columns[-1]])
+
+
+def test_mesh_and_avatar_of_one_person_are_framed_alike(tmp_path):
+    soundfile.write(tmp_path / "a.wav", np.zeros(1600), 16000)
+    options = AnimateOptions(tmp_path / "a.wav", person="", size=128, quality="draft")
+    sequence, frames = side_by_side(options, Avatar.from_pretrained("default"))
+    background = np.round(255 * developed(backdrop(128, 128)))
+    pictures = list(frames)
+    assert np.shape(pictures) == (len(sequence), 128, 256, 3) == (3, 128, 256, 3)
+    for picture in pictures:
+        halves = picture[:, :128], picture[:, 128:]
+        for half in halves:
+            np.testing.assert_allclose(half[:64, :8], background[:64, :8], atol=1)
+        mesh, avatar = (extent(half, background) for half in halves)
+        assert np.abs(mesh - avatar).max() <= 1, (mesh, avatar)
+        assert np.abs(halves[0].astype(int) - halves[1]).mean() < 4
+
+
+def test_somebody_elses_avatar_has_its_eyes_where_the_mesh_has_them(head, tmp_path):
+    soundfile.write(tmp_path / "a.wav", np.zeros(800), 16000)
+    shape = torch.linspace(-1, 1, len(head.shape_names))[None]
+    offset = torch.tensor([0.05, -0.05, 0.1]).expand(head.n_vertices, 3)
+    eyes = torch.from_numpy(np.flatnonzero(np.isin(head.mesh.faces, head.regions["eyes"]).all(1)))
+    config = AvatarConfig(latent=0, background=(0.0, 0.0, 1.0))
+    avatar = Avatar(config, head, shape=shape, static_offset=offset, face=eyes, opacity=0.95)
+    with torch.no_grad():
+        avatar.sh0[:] = torch.tensor([1.7, -1.7, -1.7])
+        avatar.sh_rest[:] = 0
+    options = AnimateOptions(tmp_path / "a.wav", person="mei", size=96, quality="draft")
+    sequence, frames = side_by_side(options, avatar)
+    picture = next(frames)[:, 96:].astype(int)
+    red = np.argwhere((picture[..., 0] > 150) & (picture[..., 1] < 100)).mean(0)
+    person = make_appearance(head, find_person("mei"))
+    posed = sequence.posed(head, torch.from_numpy(person.shape)[None])[0, head.regions["eyes"]]
+    seen = head_camera(person, 96, 96).project(posed.mean(0))
+    np.testing.assert_allclose(red + 0.5, seen[[1, 0]], atol=1.0)
+
+
+def test_the_demo_knows_the_mesh_alone_and_what_it_cannot_write(tmp_path, capsys, monkeypatch):
+    soundfile.write(tmp_path / "a.wav", np.zeros(1600), 16000)
+    monkeypatch.setattr("meshanim.cli.demo.CLIP", str(tmp_path / "a.wav"))
+    assert run("demo", "--avatar", "none", "-o", tmp_path / "a.npz") == 0
+    assert len(MeshSequence.load(tmp_path / "a.npz")) == 3
+    assert run("demo", "-o", tmp_path / "a.png", "--size", 32) == 0
+    assert Image.open(tmp_path / "a.png").size == (6 * 64, 32)
+    capsys.readouterr()
+    for words, error in (
+        (("-o", tmp_path / "a.npz"), "must be one of .mp4, .png"),
+        (("-o", tmp_path / "a.mp4", "--size", 15), "even"),
+        (("-o", tmp_path / "missing" / "a.mp4"), "cannot write"),
+        (("-o", tmp_path / "a.mp4", "--avatar", tmp_path / "nobody"), "nobody"),
+        (("-o", tmp_path / "a.mp4", "--person", "zoe"), "no person named zoe"),
+    ):
+        assert run("demo", *words) == 2
+        printed = capsys.readouterr().err.strip()
+        assert error in printed
+        assert "\n" not in printed
+    assert not (tmp_path / "a.mp4").exists()
 
 
 @pytest.mark.parametrize(
