@@ -89,7 +89,7 @@ def _draw(
 ) -> Iterator[np.ndarray]:
     like = avatar.means
     behind = None
-    if np.ndim(background) == 3:
+    if isinstance(background, np.ndarray) and background.ndim == 3:
         behind, background = torch.as_tensor(background).to(like), (0.0, 0.0, 0.0)
     cameras = cameras.to(like.device).to(like.dtype)
     vertices, template = on_avatar(avatar, sequence), avatar_template(avatar)
