@@ -19,6 +19,7 @@ from meshanim.gaussians.avatar.density import DensityStatistics, refine, reset_o
 from meshanim.gaussians.avatar.model import Avatar, AvatarConfig
 from meshanim.gaussians.avatar.optimizer import carry, forget_opacities, make_optimizer, rate_at
 from meshanim.gaussians.avatar.pictures import PictureStore, backdrop, scene_radius
+from meshanim.gaussians.avatar.run_record import check_record, fingerprints, write_record
 from meshanim.gaussians.avatar.settings import FitSettings, Regularizers, preset
 from meshanim.gaussians.avatar.tracking import Tracking, parse_noise, perturbed
 from meshanim.gaussians.gaussians import Gaussians
@@ -41,7 +42,7 @@ class FitAvatarOptions:
     capture: Positional[Path]
     """A capture: plain multi-view folder, VHAP or NeRSemble (meshanim data synthesize --images makes one)."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """Gets model/ (the avatar), fit.json, tensorboard/ and checkpoints/."""
+    """Gets model/ (the avatar), run.json, fit.json, tensorboard/ and checkpoints/."""
     preset: Literal["small", "paper"] = "small"
     """small: minutes on two cores; paper: GaussianAvatars' 600,000 steps, for a GPU."""
     size: int = 0
@@ -62,7 +63,7 @@ class FitAvatarOptions:
     half: bool = False
     """Write the avatar with floats of 16 bits: half the size, for an avatar to pass on."""
     resume: bool = False
-    """Go on from the newest checkpoint in the output folder."""
+    """Go on from the newest checkpoint in the output folder, with the same options and capture."""
     save_every: int = 2000
     """Steps between checkpoints."""
     log_every: int = 50
@@ -90,6 +91,8 @@ def fit_avatar(options: FitAvatarOptions, progress: bool = True) -> Results:
         raise OptionError(f"{options.output} holds a run already: --resume it, or choose another folder")
     capture = sized_capture(options.capture, options.size, options.head)
     views = capture.split(options.split)
+    if not views:
+        raise OptionError(f"split {options.split} of {capture.directory} has no pictures")
     if capture.parameters is None:
         raise OptionError(f"{capture.directory} holds no parameters of a head to pose an avatar by")
     size = max(max(capture.views[index].width, capture.views[index].height) for index in views)
@@ -130,8 +133,24 @@ def fit_avatar(options: FitAvatarOptions, progress: bool = True) -> Results:
     trainer = AvatarTrainer(
         learner, task, train, options.output, settings, scene_radius(capture), options.cpu
     )
-    if options.resume:
+    record = {
+        "preset": options.preset,
+        "iterations": settings.iterations,
+        "size": size,
+        "split": options.split,
+        "head": capture.head_name,
+        "background": behind,
+        "refine-tracking": options.refine_tracking,
+        "tracking-noise": options.tracking_noise,
+        "seed": options.seed,
+        "name": capture.name,
+        "capture": fingerprints(capture, store, views),
+    }
+    if options.resume and last_checkpoint(options.output) is not None:
+        check_record(options.output, record, settings)
         trainer.resume()
+    elif trainer.accelerator.is_main_process:
+        write_record(options.output, record, settings)
     begun, first = time.perf_counter(), trainer.step
     trainer.run(progress=progress)
     seconds = time.perf_counter() - begun

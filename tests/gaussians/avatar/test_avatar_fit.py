@@ -1,5 +1,7 @@
 """Fits of a few steps to pictures whose truth is known."""
 
+import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -79,6 +81,61 @@ def test_interrupted_and_resumed_is_uninterrupted(preset, capture, tiny, tmp_pat
         assert all(torch.equal(whole[key], parts[key]) for key in whole)
     with pytest.raises(OptionError, match="--resume"):
         fit(capture, tmp_path / "parts")
+
+
+def shifted(capture: Path, target: Path) -> Path:
+    """The same capture, its first camera a millimetre away."""
+    shutil.copytree(capture, target)
+    content = json.loads((target / "cameras.json").read_text())
+    content["cameras"]["c0"]["world_to_camera"][0][3] += 0.001
+    (target / "cameras.json").write_text(json.dumps(content))
+    return target
+
+
+def repainted(capture: Path, target: Path) -> Path:
+    shutil.copytree(capture, target)
+    path = target / "images" / "00000_c0.png"
+    Image.fromarray(255 - np.asarray(Image.open(path))).save(path)
+    return target
+
+
+def test_a_resumed_run_must_be_the_one_that_was_begun(capture, tiny, tmp_path, capsys, monkeypatch):
+    begun = tmp_path / "run"
+    words = ["avatar", "fit", str(capture), "-o", str(begun), "--iterations", "8", "--save-every", "4"]
+    assert main(words) == 0
+    before = (begun / "checkpoints" / "0000008" / "trainer.safetensors").read_bytes()
+    for changed, error in (
+        (["--preset", "paper"], "preset 'small', not 'paper'"),
+        (["--size", "10"], "size 20, not 10"),
+        (["--iterations", "9"], "iterations 8, not 9"),
+        (["--refine-tracking"], "refine-tracking False, not True"),
+        (["--tracking-noise", "translation=0.01"], "tracking-noise '', not 'translation=0.01'"),
+        (["--split", "novel_view"], "split 'train', not 'novel_view'; another pictures' names"),
+        (["--background", "white"], "background [1.0, 0.8, 0.6], not [1.0, 1.0, 1.0]"),
+        (["--seed", "1"], "seed 0, not 1"),
+        ([str(shifted(capture, tmp_path / "shifted"))], "begun with another cameras:"),
+        ([str(repainted(capture, tmp_path / "repainted"))], "begun with another pictures:"),
+    ):
+        if changed[0].startswith("--"):
+            assert main([*words, *changed, "--resume"]) == 2
+        else:
+            assert main([*words[:2], *changed, *words[3:], "--resume"]) == 2
+        printed = capsys.readouterr().err.strip()
+        assert error in printed, printed
+        assert "\n" not in printed
+    with monkeypatch.context() as other:  # a library whose preset has other numbers
+        small = replace(settings.PRESETS["small"], opacity=0.5)
+        other.setitem(settings.PRESETS, "small", small)
+        assert main([*words, "--resume"]) == 2
+        assert "another settings" in capsys.readouterr().err
+    moved = shutil.copytree(capture, tmp_path / "elsewhere")
+    same = [*words[:2], str(moved), *words[3:], "--resume", "--half", "--log-every", "1"]
+    assert main(same) == 0
+    assert (begun / "checkpoints" / "0000008" / "trainer.safetensors").read_bytes() == before
+    capsys.readouterr()
+    (begun / "run.json").unlink()
+    assert main([*words, "--resume"]) == 2
+    assert "run.json" in capsys.readouterr().err
 
 
 def test_refined_tracking_comes_closer_to_the_truth(capture, tiny, tmp_path):
@@ -213,3 +270,9 @@ def test_commands(capture, tiny, tmp_path, capsys):
     assert "LPIPS: not measured" in printed
     assert main([*words[:4], "--size", "4000"]) == 2
     assert "have 20 pixels" in capsys.readouterr().err
+    (tmp_path / "file").write_text("")
+    output = str(tmp_path / "file" / "run")
+    assert main(["avatar", "fit", str(capture), "-o", output, "--iterations", "2"]) == 2
+    printed = capsys.readouterr().err.strip()
+    assert "cannot write" in printed
+    assert "\n" not in printed
