@@ -8,6 +8,7 @@ import trimesh
 from PIL import Image
 
 from meshanim.cli import main
+from meshanim.cli.animate import AnimateOptions, perform
 from meshanim.motion import MeshSequence
 
 
@@ -46,6 +47,28 @@ def test_npz_glb_and_sheet(speech, tmp_path):
     assert len(trimesh.load(tmp_path / "talk.glb").geometry) == 5
     assert run("animate", speech, "-o", tmp_path / "talk.png", "--size", 64, "--quality", "draft") == 0
     assert Image.open(tmp_path / "talk.png").size == (6 * 32, 2 * 32)
+
+
+def test_weights_out_and_in(speech, tmp_path, capsys):
+    """Speech to a table; the table played again gives the vertices, the turn of the head and the sound."""
+    words = ("--seed", 3, "--fps", 25)
+    assert run("animate", speech, "-o", tmp_path / "talk.npz", *words) == 0
+    first = MeshSequence.load(tmp_path / "talk.npz")
+    assert run("animate", speech, "-o", tmp_path / "talk.csv", "--csv", "livelink", *words) == 0
+    assert "residual rms [mm]" in capsys.readouterr().out
+    _, again = perform(AnimateOptions(tmp_path / "talk.csv", sound=speech))
+    assert (len(again), again.fps) == (9, 25)
+    assert 1000 * np.linalg.norm(again.vertices - first.vertices, axis=2).max() < 1.5
+    np.testing.assert_allclose(again.pose, first.pose, atol=1e-6)
+    assert len(again.audio.samples) == 5333
+    (tmp_path / "cut.csv").write_text((tmp_path / "talk.csv").read_text()[:-20])
+    for bad, message in (
+        ((tmp_path / "cut.csv",), "cut.csv: frame 9 has"),
+        ((speech, "--sound", speech), "--sound"),
+        ((tmp_path / "talk.npz",), "holds no blendshape weights"),
+    ):
+        assert run("animate", *bad, "-o", tmp_path / "x.npz") == 2
+        assert message in capsys.readouterr().err
 
 
 def test_another_head_by_correspondence(speech, tmp_path):

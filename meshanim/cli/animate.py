@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -14,28 +14,39 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from meshanim.animator import AnimationOptions, Animator
 from meshanim.audio import load_waveform
 from meshanim.errors import OptionError
+from meshanim.export.usd import USD_ENDINGS
 from meshanim.files import check_writable
-from meshanim.heads import DefaultHead
+from meshanim.heads import DefaultHead, Head
 from meshanim.motion import MeshSequence
+from meshanim.motion.blendshape_csv import CsvForm
+from meshanim.motion.blendshape_solver import SolverOptions
+from meshanim.motion.blendshape_track import BlendshapeTrack
+from meshanim.motion.solve_sequence import arkit_only, solve_sequence
 from meshanim.render import Camera
 
 __all__ = ["COMMANDS", "AnimateOptions", "Scene", "animate", "announce", "check_size", "perform"]
 
-ENDINGS = (".mp4", ".glb", ".npz", ".png")
+RECORDED = (".csv", ".npz")
+ENDINGS = (".mp4", ".glb", ".npz", ".png", ".csv", *USD_ENDINGS)
 
 
 @dataclass(frozen=True)
 class AnimateOptions:
-    """Speech in; a video, glTF, npz or contact sheet of a talking head out.
+    """Speech in; a video, glTF, USD, npz, table of weights or contact sheet of a talking head out.
 
     Example: meshanim animate speech.wav -o talk.mp4
     """
 
     speech: Positional[Path]
-    """Sound file: wav, flac, ogg, mp3 and whatever else libsndfile reads."""
+    """Sound file: wav, flac, ogg, mp3 and whatever else libsndfile reads. Or motion to be shown: a .csv of
+    Audio2Face-3D or Live Link Face, or an .npz that `meshanim solve` wrote."""
+    sound: Path | None = None
+    """The sound that goes with such motion."""
     output: Annotated[Path, arg(aliases=["-o"])] = Path("talk.mp4")
     """The ending chooses: mp4 (with sound), glb (any glTF viewer), npz (vertices, pose, fps), png (contact
-    sheet)."""
+    sheet), csv (blendshape weights, solved), usda or usdc (the face, its shapes and weights; extra usd)."""
+    csv: CsvForm = "audio2face"
+    """Whose columns a csv has: of Audio2Face-3D or of Live Link Face."""
     model: str = "default"
     """Checkpoint: default, a folder that `meshanim train` wrote, or a repository of the hub."""
     head: str = "default"
@@ -72,8 +83,10 @@ def animate(options: AnimateOptions) -> None:
         scene.write_glb(sequence)
     elif ending == ".png":
         scene.write_sheet(sequence)
-    else:
+    elif ending == ".mp4":
         scene.write_video(sequence)
+    else:
+        scene.write_weights(sequence)
     announce(options.output, sequence)
 
 
@@ -91,9 +104,13 @@ def announce(output: Path, sequence: MeshSequence) -> None:
 
 def perform(options: AnimateOptions) -> tuple["Scene", MeshSequence]:
     """What is drawn, and how it moves."""
-    speech = load_waveform(options.speech, rate=None)
     animator = Animator.from_pretrained(options.model, None if options.head == "own" else options.head)
     scene = Scene(animator, options)
+    if options.speech.suffix.lower() in RECORDED:
+        return scene, scene.recorded(BlendshapeTrack.load(options.speech))
+    if options.sound is not None:
+        raise OptionError("--sound goes with motion from a .csv or .npz; a sound file is its own")
+    speech = load_waveform(options.speech, rate=None)
     sequence = animator(speech, options.performance, scene.template, progress=sys.stderr.isatty())
     return scene, sequence
 
@@ -103,10 +120,12 @@ def _animate_avatar(avatar: str, options: AnimateOptions) -> None:
 
     if options.head != "default" or options.skin is not None:
         raise OptionError("--head and --skin are of meshes; an avatar has its own")
+    recorded = options.speech.suffix.lower() in RECORDED
     render(
         RenderOptions(
             avatar,
-            audio=options.speech,
+            motion=options.speech if recorded else None,
+            audio=options.sound if recorded else options.speech,
             output=options.output,
             size=options.size,
             model=options.model,
@@ -136,6 +155,14 @@ class Scene:
 
     def _shape(self) -> torch.Tensor | None:
         return None if self.appearance is None else torch.from_numpy(self.appearance.shape)[None]
+
+    def recorded(self, track: BlendshapeTrack) -> MeshSequence:
+        """Weights from a file on this head, with the sound that was given."""
+        if self.animator.head is None:
+            raise OptionError("weights need a head with blendshapes; this checkpoint has a mesh alone")
+        sequence = track.animate(self.animator.head, self.template)
+        sound = self.options.sound
+        return sequence if sound is None else replace(sequence, audio=load_waveform(sound, rate=None))
 
     def frames(self, sequence: MeshSequence, size: int, camera: Camera | None = None) -> Iterator[np.ndarray]:
         """Pictures, `size` pixels a side, from the front if no camera is given."""
@@ -172,6 +199,25 @@ class Scene:
         labels = [f"{(index + 0.5) / sequence.fps:.2f} s" for index in chosen]
         write_png(self.options.output, contact_sheet(frames, columns=6, labels=labels))
 
+    def write_weights(self, sequence: MeshSequence) -> None:
+        from meshanim.export import write_track
+
+        head = self.animator.head
+        if head is None or not head.expression_names:
+            raise OptionError(
+                "weights need a head with blendshapes; `meshanim solve` gives it the default head's"
+            )
+        terms = SolverOptions()
+        if self.options.output.suffix.lower() == ".csv" and self.options.csv == "livelink":
+            terms = arkit_only(terms, head)
+        solved = solve_sequence(sequence, head, terms, progress=sys.stderr.isatty())
+        neutral = sequence.mesh.vertices
+        write_track(self.options.output, solved.track, head, neutral, self._pivot(head), self.options.csv)
+        print(solved.residual.table())
+
+    def _pivot(self, head: Head) -> np.ndarray:
+        return head.joints(self._shape())[0, 1].numpy()
+
     def write_glb(self, sequence: MeshSequence) -> None:
         from meshanim.export import write_glb
         from meshanim.export.materials import gltf_materials
@@ -180,7 +226,7 @@ class Scene:
         if head is None:
             write_glb(self.options.output, sequence)
             return
-        pivot = head.joints(self._shape())[0, 1].numpy()
+        pivot = self._pivot(head)
         follow = head.weights[:, 1:].sum(1).numpy()
         materials = None
         if self.appearance is not None and isinstance(head, DefaultHead):

@@ -22,6 +22,7 @@ from meshanim.gaussians.avatar.playback import avatar_template, play
 from meshanim.gaussians.camera_paths import camera_path, read_camera_path
 from meshanim.gaussians.cameras import Cameras
 from meshanim.motion import MeshSequence
+from meshanim.motion.blendshape_track import BlendshapeTrack
 
 __all__ = ["COMMANDS", "RenderOptions", "render", "write_pictures"]
 
@@ -38,7 +39,8 @@ class RenderOptions:
     avatar: Positional[str]
     """Folder of an avatar: model/ of what `meshanim avatar fit` wrote."""
     motion: Path | None = None
-    """Animation to play, an .npz that `meshanim animate` or `MeshSequence.save` wrote, of any topology."""
+    """Animation to play: an .npz that `meshanim animate` or `MeshSequence.save` wrote, of any topology, or a
+    .csv with weights of the head's shapes (Audio2Face-3D's, or a recording of Live Link Face)."""
     audio: Path | None = None
     """Speech to say; beside --motion, the sound that goes with it."""
     camera: str = "front"
@@ -97,7 +99,10 @@ def _check(options: RenderOptions) -> None:
 def _sequence(avatar: Avatar, options: RenderOptions) -> MeshSequence:
     speech = None if options.audio is None else load_waveform(options.audio, rate=None)
     if options.motion is not None:
-        sequence = MeshSequence.load(options.motion)
+        if options.motion.suffix.lower() == ".csv":
+            sequence = BlendshapeTrack.load(options.motion).animate(avatar.head)
+        else:
+            sequence = MeshSequence.load(options.motion)
         return MeshSequence(sequence.vertices, sequence.fps, sequence.mesh, sequence.pose, speech)
     assert speech is not None
     animator = Animator.from_pretrained(options.model, avatar.head)

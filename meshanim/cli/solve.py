@@ -8,13 +8,15 @@ from typing import Annotated
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from meshanim.errors import OptionError
+from meshanim.export.track import TRACK_ENDINGS, write_track
 from meshanim.files import check_writable
 from meshanim.heads import load_head
 from meshanim.motion import MeshSequence
 from meshanim.motion.audio2face_rig import read_solver_config
+from meshanim.motion.blendshape_csv import CsvForm
 from meshanim.motion.blendshape_solver import SolverOptions
 from meshanim.motion.personal_shapes import Method
-from meshanim.motion.solve_sequence import head_for, solve_sequence
+from meshanim.motion.solve_sequence import arkit_only, head_for, solve_sequence
 from meshanim.motion.vertex_sampling import sample_vertices
 
 __all__ = ["COMMANDS", "SolveOptions", "solve"]
@@ -30,7 +32,11 @@ class SolveOptions:
     motion: Positional[Path]
     """A mesh sequence, .npz: `meshanim animate speech.wav -o talk.npz` writes one."""
     output: Annotated[Path, arg(aliases=["-o"])] = Path("weights.csv")
-    """The ending chooses: csv (columns of Audio2Face-3D) or npz (names, weights, fps, pose)."""
+    """The ending chooses: csv, npz (names, weights, fps, pose), or the face with its shapes and weights as
+    glb, usda or usdc (extra usd)."""
+    csv: CsvForm = "audio2face"
+    """Whose columns a csv has: those of Audio2Face-3D, or those of Live Link Face, which has the head's turn
+    and ARKit's 52 shapes alone."""
     head: str = "default"
     """Whose shapes: default, rig:/path/face.glb or any other that `load_head` takes. A sequence of another
     topology gets them by correspondence with its template."""
@@ -52,7 +58,7 @@ class SolveOptions:
 
 def solve(options: SolveOptions) -> None:
     """Run the verb."""
-    for path, endings in ((options.output, (".csv", ".npz")), (options.replay, (".npz",))):
+    for path, endings in ((options.output, TRACK_ENDINGS), (options.replay, (".npz",))):
         if path is not None and path.suffix.lower() not in endings:
             raise OptionError(f"cannot write {path}: the ending must be {' or '.join(endings)}")
         if path is not None:
@@ -66,8 +72,10 @@ def solve(options: SolveOptions) -> None:
         count = len(sample_vertices(head, options.samples).vertices)
         terms = read_solver_config(options.config, head.expression_names, count)
         terms = replace(terms, nvidia_parity=options.terms.nvidia_parity)
+    if options.output.suffix.lower() == ".csv" and options.csv == "livelink":
+        terms = arkit_only(terms, head)
     solved = solve_sequence(sequence, head, terms, options.samples, sys.stderr.isatty())
-    solved.track.save(options.output)
+    write_track(options.output, solved.track, head, sequence.mesh.vertices, csv=options.csv)
     if options.replay is not None:
         other = options.replay_head
         motion = solved.motion if other is None else solved.track.animate(load_head(other))

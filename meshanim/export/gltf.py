@@ -10,17 +10,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import roma
-import torch
 from jaxtyping import Float, Int
 
 from meshanim.errors import OptionError, ShapeError
+from meshanim.export.blendshape_motion import BlendshapeMotion, smooth_quaternions
 from meshanim.files import written_whole
 from meshanim.geometry import TriangleMesh
 from meshanim.heads import Rig
 from meshanim.motion import MeshSequence
 
-__all__ = ["GltfMaterial", "morph_basis", "write_glb", "write_morph_targets"]
+__all__ = ["GltfMaterial", "morph_basis", "write_blendshape_glb", "write_glb", "write_morph_targets"]
 
 FLOAT, UNSIGNED_INT, UNSIGNED_BYTE = 5126, 5125, 5121
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
@@ -138,19 +137,85 @@ def write_glb(
     ShapeError
         If the sequence has no frames or `pose_weights` does not fit the mesh.
     """
-    if len(sequence) == 0:
+    _check_motion(len(sequence), sequence.mesh, pose_weights)
+    template = sequence.mesh.vertices.astype(np.float32)
+    targets, weights, error = morph_basis(sequence.vertices - template, tolerance)
+    names = [f"component_{index:02d}" for index in range(len(targets))]
+    _write_animation(
+        path,
+        sequence.mesh,
+        targets,
+        weights,
+        names,
+        sequence.fps,
+        sequence.pose,
+        materials,
+        pivot,
+        pose_weights,
+    )
+    return error
+
+
+def write_blendshape_glb(
+    path: str | Path, motion: BlendshapeMotion, materials: list[GltfMaterial] | None = None
+) -> None:
+    """Write a mesh that its named blendshapes move; the names are in mesh.extras.targetNames.
+
+    Parameters
+    ----------
+    path : str or Path
+        The .glb file, written whole.
+    motion : BlendshapeMotion
+        Shapes that stay at zero are written as well: a user may want to animate on.
+    materials : list of GltfMaterial, optional
+        As of `write_glb`.
+
+    Raises
+    ------
+    ShapeError
+        If the motion has no frames.
+    """
+    _check_motion(len(motion.weights), motion.mesh, motion.follow)
+    _write_animation(
+        path,
+        motion.mesh,
+        motion.deltas,
+        motion.weights,
+        list(motion.names),
+        motion.fps,
+        motion.pose,
+        materials,
+        motion.pivot,
+        motion.follow,
+    )
+
+
+def _check_motion(frames: int, mesh: TriangleMesh, pose_weights: np.ndarray | None) -> None:
+    if frames == 0:
         raise ShapeError("a glTF animation needs at least one frame")
-    mesh = sequence.mesh
     if pose_weights is not None and pose_weights.shape != (mesh.n_vertices,):
         raise ShapeError(f"pose_weights has shape {pose_weights.shape}, the mesh {mesh.n_vertices} vertices")
-    template = mesh.vertices.astype(np.float32)
-    targets, weights, error = morph_basis(sequence.vertices - template, tolerance)
+
+
+def _write_animation(
+    path: str | Path,
+    mesh: TriangleMesh,
+    targets: Float[np.ndarray, "targets vertices 3"],
+    weights: Float[np.ndarray, "frames targets"],
+    names: list[str],
+    fps: float,
+    pose: Float[np.ndarray, "frames 3"],
+    materials: list[GltfMaterial] | None,
+    pivot: Float[np.ndarray, " 3"] | None,
+    pose_weights: Float[np.ndarray, " vertices"] | None,
+) -> None:
     buffer = _Buffer()
     pivot = np.zeros(3) if pivot is None else np.asarray(pivot, np.float64)
     weight = np.ones(mesh.n_vertices) if pose_weights is None else np.asarray(pose_weights)
     materials = materials or [GltfMaterial("surface", np.arange(mesh.n_faces))]
+    weights = np.asarray(weights, np.float32)
     normals = _normals(mesh)
-    changes = [_normals(mesh.with_vertices(template + target)) - normals for target in targets]
+    changes = [_normals(mesh.with_vertices(mesh.vertices + target)) - normals for target in targets]
     primitives = [
         _primitive(buffer, mesh, targets, normals, changes, weight, one, index)
         for index, one in enumerate(materials)
@@ -162,29 +227,23 @@ def write_glb(
         {"name": "root", "children": [2]},
         {"name": "neck", "translation": pivot.tolist()},
     ]
-    pose = torch.from_numpy(np.asarray(sequence.pose, np.float32))
-    rotation = roma.rotvec_to_unitquat(pose).numpy()  # x, y, z, w as glTF wants
-    flip = np.cumprod(np.sign(np.r_[1.0, (rotation[1:] * rotation[:-1]).sum(1)]) + 0.0)  # shortest way
-    rotation = rotation * np.where(flip == 0, 1, flip)[:, None].astype(np.float32)
-    times = (np.arange(len(sequence)) / sequence.fps).astype(np.float32)
+    rotation = smooth_quaternions(pose)
+    times = (np.arange(len(weights)) / fps).astype(np.float32)
     time = buffer.accessor(times, "SCALAR", bounds=True)
     samplers = [{"input": time, "output": buffer.accessor(rotation, "VEC4"), "interpolation": "LINEAR"}]
     channels = [{"sampler": 0, "target": {"node": 2, "path": "rotation"}}]
+    face: dict = {"name": "head", "primitives": primitives}
     if len(targets):
-        samplers.append(
-            {
-                "input": time,
-                "output": buffer.accessor(weights.reshape(-1), "SCALAR"),
-                "interpolation": "LINEAR",
-            }
-        )
+        flat = buffer.accessor(weights.reshape(-1), "SCALAR")
+        samplers.append({"input": time, "output": flat, "interpolation": "LINEAR"})
         channels.append({"sampler": 1, "target": {"node": 0, "path": "weights"}})
+        face |= {"weights": weights[0].tolist(), "extras": {"targetNames": names}}
     gltf = {
         "asset": {"version": "2.0", "generator": "meshanim"},
         "scene": 0,
         "scenes": [{"nodes": [0, 1]}],
         "nodes": nodes,
-        "meshes": [{"name": "head", "primitives": primitives, **_initial(weights)}],
+        "meshes": [face],
         "skins": [
             {
                 "joints": [1, 2],
@@ -198,7 +257,6 @@ def write_glb(
     }
     with written_whole(path) as temporary:
         temporary.write_bytes(_glb(gltf, bytes(buffer.data)))
-    return error
 
 
 def write_morph_targets(path: str | Path, rig: Rig) -> None:
@@ -229,10 +287,6 @@ def write_morph_targets(path: str | Path, rig: Rig) -> None:
     }
     with written_whole(path) as temporary:
         temporary.write_bytes(_glb(gltf, bytes(buffer.data)))
-
-
-def _initial(weights: np.ndarray) -> dict:
-    return {"weights": weights[0].tolist()} if weights.shape[1] else {}
 
 
 def _primitive(

@@ -1,19 +1,20 @@
 """Weights of a whole mesh sequence, and what they leave of its motion."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 from tqdm import tqdm
 
 from meshanim.heads import Head, rig_head
+from meshanim.motion.blendshape_csv import ARKIT_SHAPES
 from meshanim.motion.blendshape_solver import BlendshapeSolver, SolverOptions
 from meshanim.motion.blendshape_track import BlendshapeTrack
 from meshanim.motion.personal_shapes import Method, personal_shapes
 from meshanim.motion.sequence import MeshSequence
 from meshanim.results import Results
 
-__all__ = ["SolvedSequence", "head_for", "solve_sequence"]
+__all__ = ["SolvedSequence", "arkit_only", "head_for", "solve_sequence"]
 
 FRAMES_AT_ONCE = 256
 USED = 0.01
@@ -37,6 +38,12 @@ def head_for(sequence: MeshSequence, head: Head, method: Method = "deformation_t
     if head.mesh.n_vertices == mesh.n_vertices and np.array_equal(head.mesh.faces, mesh.faces):
         return head
     return rig_head(personal_shapes(head, mesh, method))
+
+
+def arkit_only(options: SolverOptions, head: Head) -> SolverOptions:
+    """The options with no other shapes active than ARKit's 52, for tables that have no column for others."""
+    names = head.expression_names if options.active is None else options.active
+    return replace(options, active=tuple(name for name in names if name in ARKIT_SHAPES))
 
 
 def solve_sequence(

@@ -1,5 +1,3 @@
-import csv
-
 import numpy as np
 import pytest
 import torch
@@ -19,18 +17,17 @@ def test_round_trips(tmp_path):
     track = BlendshapeTrack(
         ("jawOpen", "lipSeal"), rng.uniform(size=(7, 2)), 29.97, rng.normal(size=(7, 3)).astype(np.float32)
     )
-    for ending in ("npz", "csv"):
-        track.save(tmp_path / f"a.{ending}")
-        back = BlendshapeTrack.load(tmp_path / f"a.{ending}")
-        assert back.names == track.names
-        np.testing.assert_allclose(back.weights, track.weights, rtol=1e-8)
-        assert back.fps == pytest.approx(29.97, abs=1e-5)
-    np.testing.assert_array_equal(BlendshapeTrack.load(tmp_path / "a.npz").pose, track.pose)
-    with open(tmp_path / "a.csv", newline="") as text:
-        rows = list(csv.DictReader(text))
-    assert list(rows[0]) == ["timeCode", "blendShapes.JawOpen", "blendShapes.LipSeal"]
-    assert float(rows[3]["timeCode"]) == pytest.approx(3 / 29.97)
-    assert float(rows[3]["blendShapes.JawOpen"]) == pytest.approx(track.weights[3, 0])
+    track.save(tmp_path / "a.npz")
+    back = BlendshapeTrack.load(tmp_path / "a.npz")
+    assert back.names == track.names
+    assert back.fps == 29.97
+    np.testing.assert_array_equal(back.weights, track.weights)
+    np.testing.assert_array_equal(back.pose, track.pose)
+    track.save(tmp_path / "a.csv")
+    back = BlendshapeTrack.load(tmp_path / "a.csv")
+    assert back.fps == pytest.approx(29.97, rel=1e-4)
+    for name, column in zip(track.names, track.weights.T):
+        np.testing.assert_array_equal(back.weights[:, back.names.index(name)], column)
 
 
 def test_animates_a_head(head):
@@ -70,21 +67,5 @@ def test_bad_input_is_named(tmp_path, unchecked):
         track.save(tmp_path / "a.json")
     track.save(tmp_path / "a.npz")
     (tmp_path / "cut.npz").write_bytes((tmp_path / "a.npz").read_bytes()[:200])
-    head = "timeCode,blendShapes.A,blendShapes.B\n"
-    for name, text in {
-        "none.csv": None,
-        "empty.csv": "",
-        "other.csv": "a,b\n1,2\n",
-        "rows.csv": head,
-        "cell.csv": head + "0,1,x\n",
-        "short.csv": head + "0,1,1\n0.1,1\n",
-        "nan.csv": head + "0,1,1\n0.1,nan,1\n",
-        "time.csv": head + "0.1,1,1\n0,1,1\n",
-        "twice.csv": "timeCode,blendShapes.A,blendShapes.a\n0,1,1\n",
-    }.items():
-        if text is not None:
-            (tmp_path / name).write_text(text)
-        with pytest.raises(FileFormatError, match=name):
-            BlendshapeTrack.load(tmp_path / name)
     with pytest.raises(FileFormatError, match="cut"):
         BlendshapeTrack.load(tmp_path / "cut.npz")
