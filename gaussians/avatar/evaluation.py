@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import roma
 import torch
 from jaxtyping import Bool, Float
 from PIL import Image
@@ -50,7 +51,7 @@ class EvaluateAvatarOptions:
     capture: Positional[Path]
     """The capture it was fitted to."""
     splits: tuple[str, ...] = ()
-    """Splits to score; all but train if none is named."""
+    """Splits to score; all but train that have pictures, if none is named."""
     size: int = 0
     """Largest side of the pictures, pixels; 0 for the files'."""
     head: str = ""
@@ -58,9 +59,10 @@ class EvaluateAvatarOptions:
     lpips: Path | None = None
     """AlexNet's weights (torchvision's alexnet-owt-7be5be79.pth) for LPIPS; absent without."""
     pictures: Path | None = None
-    """Folder for sheets: truth, rendering and error (four times) beside each other, eyes and mouth below."""
+    """Folder for a sheet a split: truth, rendering and error (four times) beside each other, eyes and mouth
+    below."""
     examples: int = 4
-    """Pictures a sheet, spread over the split."""
+    """Pictures a sheet, spread over the split; one of them is the one taken most from the side."""
     json: Path | None = None
     """Also write the rows here."""
 
@@ -79,9 +81,14 @@ def evaluate_avatar(options: EvaluateAvatarOptions, progress: bool = True) -> Re
     directory = options.avatar / "model" if (options.avatar / "model").is_dir() else options.avatar
     avatar = Avatar.from_pretrained(directory, options.head)
     capture = sized_capture(options.capture, options.size, options.head)
-    splits = options.splits or tuple(name for name in capture.splits if name != "train")
+    splits = options.splits or tuple(n for n, views in capture.splits.items() if n != "train" and views)
     if not splits:
-        raise OptionError(f"{capture.directory} has no split but train: name it with --splits train")
+        raise OptionError(f"{capture.directory} has no pictures but train's: name it with --splits train")
+    for split in splits:
+        if not capture.split(split):
+            raise OptionError(f"split {split} of {capture.directory} has no pictures")
+    if options.examples < 1:
+        raise OptionError(f"examples must be at least 1, not {options.examples}")
     behind, composed = backdrop(capture, "auto")
     store = PictureStore(capture, behind if composed else None)
     perceptual = None if options.lpips is None else Lpips(options.lpips)
@@ -94,7 +101,7 @@ def evaluate_avatar(options: EvaluateAvatarOptions, progress: bool = True) -> Re
         for split in splits:
             views = capture.split(split)
             scores: dict[str, list[float]] = {}
-            shown = set(np.linspace(0, len(views) - 1, min(options.examples, len(views))).round().astype(int))
+            shown = _examples([poses.sideways(index) for index in views], options.examples)
             rows = []
             for place, index in enumerate(tqdm(views, desc=split, unit="picture", disable=not progress)):
                 truth, rendered = store.image(index), poses.render(index, store)
@@ -141,6 +148,20 @@ class _Poses:
             )
         return self.capture.at(timestep)
 
+    def sideways(self, index: int) -> float:
+        """How far from the side of the head a picture was taken: 0 in front (or behind), 1 in profile."""
+        view = self.capture.views[index]
+        parameters = self.at(view.timestep)
+        turned, moved = torch.eye(3), torch.zeros(3)
+        for part in (parameters.rotation, parameters.neck):
+            if part is not None:
+                turned = turned @ roma.rotvec_to_rotmat(part[0].cpu())
+        if parameters.translation is not None:
+            moved = parameters.translation[0].cpu()
+        pose = view.world_to_camera
+        towards = -pose[:3, :3].T @ pose[:3, 3] - moved.numpy()
+        return float(abs(turned[:, 0].numpy() @ towards) / np.linalg.norm(towards))
+
     def render(self, index: int, store: PictureStore) -> Float[Tensor, "height width 3"]:
         parameters = self.at(self.capture.views[index].timestep)
         rendering = self.avatar(parameters, store.cameras(index), depth=None)
@@ -154,6 +175,15 @@ class _Poses:
             self.render(index, store)
             times.append(time.perf_counter() - start)
         return 1 / float(np.median(times))
+
+
+def _examples(sideways: Sequence[float], count: int) -> set[int]:
+    """Places spread over a split; the last but one gives way to the picture taken most from the side."""
+    places = np.linspace(0, len(sideways) - 1, min(count, len(sideways))).round().astype(int).tolist()
+    side = int(np.argmax(sideways))
+    if side not in places and len(places) > 1:
+        places[-2 if len(places) > 2 else -1] = side
+    return set(places)
 
 
 def _areas(capture: Capture, index: int, size: Sequence[int]) -> dict[str, Bool[np.ndarray, "height width"]]:

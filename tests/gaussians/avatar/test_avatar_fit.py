@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from made_capture import made_avatar, write_capture
+from made_capture import CAMERAS, TIMESTEPS, made_avatar, write_capture
 from PIL import Image
 from safetensors.torch import load_file
 
@@ -16,7 +16,12 @@ from meshanim.cli import main
 from meshanim.datasets.capture import open_capture
 from meshanim.errors import FileFormatError, OptionError
 from meshanim.gaussians.avatar import Avatar, settings
-from meshanim.gaussians.avatar.evaluation import EvaluateAvatarOptions, evaluate_avatar
+from meshanim.gaussians.avatar.evaluation import (
+    EvaluateAvatarOptions,
+    _examples,
+    _Poses,
+    evaluate_avatar,
+)
 from meshanim.gaussians.avatar.fit import FitAvatarOptions, fit_avatar, regularization
 from meshanim.gaussians.avatar.lpips import LAYERS, Lpips
 from meshanim.gaussians.avatar.pictures import PictureStore, backdrop
@@ -207,6 +212,55 @@ def test_the_true_avatar_scores_as_well_as_8_bits_allow(tmp_path):
     assert Results.load(tmp_path / "scores.json").rows == results.rows
     with pytest.raises(OptionError, match="no split"):
         evaluate_avatar(replace(options, splits=("else",)), progress=False)
+    with pytest.raises(OptionError, match="examples must be"):
+        evaluate_avatar(replace(options, examples=0), progress=False)
+
+
+def test_sheets_have_a_picture_from_the_side_and_details(tmp_path):
+    """Cameras c0 and c2 stand 46 degrees aside, c1 in front; then the head turns."""
+    truth = write_capture(tmp_path / "ball")
+    truth.save_pretrained(tmp_path / "avatar")
+    capture = open_capture(tmp_path / "ball")
+    poses = _Poses(truth, capture, tmp_path / "avatar")
+    seen = {view.camera: poses.sideways(index) for index, view in enumerate(capture.views)}
+    assert seen == pytest.approx({"c0": np.sin(0.8), "c1": 0.0, "c2": np.sin(0.8)}, abs=1e-6)
+    turned = replace(capture.parameters, rotation=torch.tensor([[0.0, 0.3, 0.0]]).expand(TIMESTEPS, 3))
+    poses = _Poses(truth, replace(capture, parameters=turned), tmp_path / "avatar")
+    seen = sorted(poses.sideways(index) for index in range(CAMERAS))
+    assert seen == pytest.approx(sorted(np.sin([0.5, 0.3, 1.1])), abs=1e-6)
+    assert _examples([0.0, 0.1, 0.9, 0.2, 0.0, 0.3, 0.1], 4) == {0, 2, 4, 6}
+    assert _examples([0.0, 0.9, 0.2, 0.1, 0.0, 0.3, 0.1], 3) == {0, 1, 6}
+    assert _examples([0.0, 0.9, 0.1], 2) == {0, 1}
+    assert _examples([0.0, 0.9, 0.1], 1) == {0}
+    assert _examples([0.5], 4) == {0}
+    # A region that is the mouth is shown enlarged below, truth beside rendering.
+    record = json.loads((tmp_path / "ball" / "capture.json").read_text())
+    record["regions"] = ["background", "mouth"]
+    (tmp_path / "ball" / "capture.json").write_text(json.dumps(record))
+    options = EvaluateAvatarOptions(
+        tmp_path / "avatar", tmp_path / "ball", ("novel_view",), pictures=tmp_path / "sheets", examples=2
+    )
+    evaluate_avatar(options, progress=False)
+    with Image.open(tmp_path / "sheets" / "novel_view.png") as sheet:
+        assert sheet.size == (60, 2 * 35)
+        details = np.asarray(sheet).astype(int)[20:35, :30]
+    assert np.abs(details[:, :15] - details[:, 15:]).max() <= 2
+    assert np.ptp(details[:, :15], axis=(0, 1)).max() > 50
+
+
+def test_a_split_without_pictures_is_left_out_or_named(tmp_path):
+    truth = write_capture(tmp_path / "ball")
+    truth.save_pretrained(tmp_path / "avatar")
+    record = json.loads((tmp_path / "ball" / "capture.json").read_text())
+    record["splits"]["novel_view"] = []
+    (tmp_path / "ball" / "capture.json").write_text(json.dumps(record))
+    options = EvaluateAvatarOptions(tmp_path / "avatar", tmp_path / "ball")
+    cases = {row.case for row in evaluate_avatar(options, progress=False).rows}
+    assert cases == {"Ball", "novel_expression", "playback"}
+    with pytest.raises(OptionError, match=r"novel_view .* has no pictures"):
+        evaluate_avatar(replace(options, splits=("novel_view",)), progress=False)
+    with pytest.raises(OptionError, match=r"novel_view .* has no pictures"):
+        fit(tmp_path / "ball", tmp_path / "run", split="novel_view")
 
 
 def test_pictures_without_a_plain_background_are_put_on_white(tmp_path):
