@@ -5,6 +5,7 @@ import sys
 from meshanim.audio.viseme_evaluation import EvaluateVisemesOptions, evaluate_visemes
 from meshanim.comparison import CompareOptions, compare, comparison_results, comparison_table
 from meshanim.results import Results
+from meshanim.training.audio2face_evaluation import EvaluateAudio2FaceOptions, evaluate_audio2face
 from meshanim.training.folder_evaluation import EvaluateMotionOptions, evaluate_motion
 from meshanim.training.gava_ablation import AblationOptions, ablation_table, gava_ablation
 from meshanim.training.gava_evaluation import EvaluateGavaOptions, evaluate_gava
@@ -19,6 +20,10 @@ def _gava(options: EvaluateGavaOptions) -> None:
     others = [row for row in results.rows if row.measured is None]
     if others:
         print("\n" + Results(results.name, others, results.machine).table())
+
+
+def _audio2face(options: EvaluateAudio2FaceOptions) -> None:
+    print(evaluate_audio2face(options, progress=sys.stderr.isatty()).metrics_table())
 
 
 def _gava_ablation(options: AblationOptions) -> None:
@@ -50,6 +55,7 @@ def _visemes(options: EvaluateVisemesOptions) -> None:
 
 COMMANDS = {
     "gava": _gava,
+    "a2f": _audio2face,
     "gava-ablation": _gava_ablation,
     "gava-maps": _gava_maps,
     "motion": _motion,
