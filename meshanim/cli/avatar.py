@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -91,9 +91,26 @@ def _check(options: RenderOptions) -> None:
     check_size(options.size)
     if options.motion is None and options.audio is None:
         raise OptionError("what is to be played? give --motion FILE.npz or --audio FILE.wav")
+    if options.motion is not None:
+        unused = _of_speech(options)
+        if unused:
+            raise OptionError(
+                f"{', '.join(unused)}: how speech is animated; with --motion there is none to be"
+            )
     if options.background is not None and not all(0 <= value <= 1 for value in options.background):
         raise OptionError(f"background must lie within 0 to 1, not {options.background}")
     check_writable(options.output)
+
+
+def _of_speech(options: RenderOptions) -> list[str]:
+    """Options that were given and that a motion has no use for; it knows `fps`."""
+    usual = AnimationOptions()
+    given = [] if options.model == RenderOptions(options.avatar).model else ["--model"]
+    for option in fields(usual):
+        value, default = (getattr(one, option.name) for one in (options.performance, usual))
+        if option.name != "fps" and value is not default and value != default:
+            given.append(f"--{option.name.replace('_', '-')}")
+    return given
 
 
 def _sequence(avatar: Avatar, options: RenderOptions) -> MeshSequence:
@@ -102,8 +119,9 @@ def _sequence(avatar: Avatar, options: RenderOptions) -> MeshSequence:
         if options.motion.suffix.lower() == ".csv":
             sequence = BlendshapeTrack.load(options.motion).animate(avatar.head)
         else:
-            sequence = MeshSequence.load(options.motion)
-        return MeshSequence(sequence.vertices, sequence.fps, sequence.mesh, sequence.pose, speech)
+            sequence = replace(MeshSequence.load(options.motion), audio=speech)
+        fps = options.performance.fps
+        return sequence if fps is None else sequence.resampled(fps)
     assert speech is not None
     animator = Animator.from_pretrained(options.model, avatar.head)
     return animator(speech, options.performance, progress=sys.stderr.isatty())

@@ -49,7 +49,7 @@ def demo(options: DemoOptions) -> None:
     """Run the verb."""
     started = time.perf_counter()
     with as_file(files("meshanim").joinpath(CLIP)) as spoken:
-        what = AnimateOptions(spoken, options.output, person=options.person, size=options.size)
+        what = AnimateOptions(spoken, output=options.output, person=options.person, size=options.size)
         if options.avatar == "none":
             animate(replace(what, person=options.person or PERSON))
         else:

@@ -1,5 +1,6 @@
 """`MeshSequence`: an animated mesh with its frame rate, head pose and sound."""
 
+import math
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,7 @@ from meshanim.errors import FileFormatError, OptionError, ShapeError
 from meshanim.files import written_whole
 from meshanim.geometry import TriangleMesh
 from meshanim.heads import Head
+from meshanim.motion.pose_track import resample_rotations
 
 __all__ = ["MeshSequence"]
 
@@ -80,6 +82,30 @@ class MeshSequence:
             for at in [slice(start, start + 256)]
         ]
         return np.concatenate(parts) if parts else self.vertices
+
+    def resampled(self, fps: float) -> "MeshSequence":
+        """The same motion at another frame rate: vertices linearly, head rotations along the shortest turns.
+
+        Frame i is at (i + 0.5) / fps seconds, before and after; the ends hold. As many frames as begin before
+        the motion ends.
+
+        Raises
+        ------
+        OptionError
+            If `fps` is not positive and finite, or there is no frame.
+        """
+        if not (np.isfinite(fps) and fps > 0) or len(self) == 0:
+            raise OptionError(f"cannot resample {len(self)} frames from {self.fps:g} to {fps:g} fps")
+        if fps == self.fps:
+            return self
+        count = max(1, math.ceil(self.duration * fps - 1e-6))
+        position = np.clip((np.arange(count) + 0.5) / fps * self.fps - 0.5, 0, len(self) - 1)
+        lower = position.astype(np.int64)
+        upper = np.minimum(lower + 1, len(self) - 1)
+        weight = (position - lower).astype(np.float32)[:, None, None]
+        vertices = self.vertices[lower] * (1 - weight) + self.vertices[upper] * weight
+        pose = resample_rotations(self.pose, self.fps, fps, count)
+        return MeshSequence(vertices, fps, self.mesh, pose, self.audio)
 
     def save(self, path: str | Path) -> None:
         """Write an npz with `vertices` (T, V, 3), `faces` (F, 3), `fps`, `pose` (T, 3), `template` (V, 3).

@@ -45,3 +45,25 @@ def test_what_does_not_fit_is_refused(tetrahedron, unchecked):
         MeshSequence(np.zeros((2, 4, 3), np.float32), 30.0, tetrahedron, np.zeros((3, 3), np.float32))
     with pytest.raises(OptionError, match=r"\.npz"):
         MeshSequence(np.zeros((2, 4, 3), np.float32), 30.0, tetrahedron).save("talk.mp4")
+
+
+def test_resampled_motion_is_the_same_in_time(tetrahedron):
+    """Linear motion and a steady turn come out exactly; a finer rate and back gives the frames back."""
+    at = (np.arange(12, dtype=np.float32) + 0.5) / 30
+    vertices = tetrahedron.vertices.astype(np.float32) + at[:, None, None]
+    pose = np.stack([0 * at, at, 0 * at], 1)
+    sequence = MeshSequence(vertices, 30.0, tetrahedron, pose)
+    for fps, count in ((60.0, 24), (25.0, 10), (24.0, 10), (29.97, 12)):
+        other = sequence.resampled(fps)
+        assert (len(other), other.fps) == (count, fps)
+        times = np.clip((np.arange(count) + 0.5) / fps, at[0], at[-1])
+        moved = other.vertices - tetrahedron.vertices
+        np.testing.assert_allclose(moved, np.broadcast_to(times[:, None, None], moved.shape), atol=1e-6)
+        np.testing.assert_allclose(other.pose[:, 1], times, atol=1e-6)
+        assert other.vertices.dtype == other.pose.dtype == np.float32
+    assert sequence.resampled(30.0) is sequence
+    one = MeshSequence(vertices[:1], 30.0, tetrahedron, pose[:1]).resampled(100.0)
+    np.testing.assert_array_equal(one.vertices, np.repeat(vertices[:1], 4, 0))
+    for fps in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(OptionError, match="resample"):
+            sequence.resampled(fps)

@@ -1,5 +1,8 @@
 """An avatar plays animations of any identity and topology; the command writes videos and sheets."""
 
+import json
+import shutil
+
 import av
 import numpy as np
 import pytest
@@ -138,6 +141,33 @@ def test_the_command_plays_motion_with_sound(head, folder, tmp_path):
     assert sheet.getpixel((1, 30)) == (255, 0, 0)
 
 
+def test_the_command_resamples_motion_and_looks_through_the_cameras_of_a_file(head, avatar, folder, tmp_path):
+    yawn(head, 5).save(tmp_path / "yawn.npz")
+    cameras = camera_path("orbit", avatar_template(avatar), 10, 20.0, 64, 32)
+    entries = {
+        f"{index:05d}": {
+            "world_to_camera": cameras.world_to_camera[index, 0].tolist(),
+            "intrinsics": cameras.intrinsics[index, 0].tolist(),
+            "width": 64,
+            "height": 32,
+        }
+        for index in range(10)
+    }
+    file = tmp_path / "cameras.json"
+    file.write_text(json.dumps({"cameras": entries}))
+    words = ("avatar", "render", folder, "--motion", tmp_path / "yawn.npz", "--fps", 20, "--size", 64)
+    assert run(*words, "--camera", file, "-o", tmp_path / "a.mp4") == 0
+    with av.open(str(tmp_path / "a.mp4")) as video:
+        assert video.streams.video[0].average_rate == 20
+        pictures = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
+    assert np.shape(pictures) == (10, 32, 64, 3)
+    sequence = MeshSequence.load(tmp_path / "yawn.npz").resampled(20.0)
+    for picture, exact in zip(pictures, play(avatar, sequence, cameras)):
+        assert np.abs(picture.astype(int) - exact).mean() < 6  # what compression leaves
+    assert run(*words, "--camera", f"{file}:00009", "-o", tmp_path / "b.png") == 0
+    assert Image.open(tmp_path / "b.png").size == (6 * 64, 2 * 32)
+
+
 def test_the_command_says_speech(folder, tmp_path):
     time = np.arange(3200) / 16000
     soundfile.write(tmp_path / "a.wav", 0.1 * np.sin(2 * np.pi * 120 * time), 16000)
@@ -220,12 +250,41 @@ def test_the_demo_knows_the_mesh_alone_and_what_it_cannot_write(tmp_path, capsys
         (("--audio", "a.wav", "--background", 2, 0, 0), "within 0 to 1"),
         (("--audio", "missing.wav",), "missing.wav"),
         (("--motion", "yawn.npz", "--camera", "behind"), "front, orbit"),
+        (("--motion", "yawn.npz", "--camera", "missing.json"), "missing.json"),
+        (("--motion", "yawn.npz", "--camera", "two.json"), "2 cameras for 3 frames"),
+        (("--motion", "yawn.npz", "--camera", "two.json:left"), "no 'left'"),
+        (("--motion", "yawn.npz", "--fps", 0), "fps"),
+        (("--motion", "yawn.npz", "--emotion", "joy", "--sway", 0), "--emotion, --sway: how speech is"),
+        (("--motion", "yawn.npz", "--model", "a2f"), "--model: how speech is"),
+        (("--motion", "cut.npz"), "cut.npz"),
+        (("--motion", "yawn.npz", "-o", "missing/a.mp4"), "cannot write missing/a.mp4"),
+        (("--motion", "yawn.npz", "-o", "folder.mp4"), "it is a folder"),
     ],
 )  # fmt: skip
 def test_bad_input_is_one_line(head, folder, tmp_path, monkeypatch, capsys, words, error):
     monkeypatch.chdir(tmp_path)
     yawn(head).save("yawn.npz")
+    (tmp_path / "cut.npz").write_bytes((tmp_path / "yawn.npz").read_bytes()[:5000])
+    (tmp_path / "folder.mp4").mkdir()
+    eye = {"world_to_camera": np.eye(4).tolist(), "intrinsics": np.eye(3).tolist(), "width": 8, "height": 8}
+    (tmp_path / "two.json").write_text(json.dumps({"cameras": {"a": eye, "b": eye}}))
     assert run("avatar", "render", folder, *words) == 2
     printed = capsys.readouterr().err.strip()
     assert error in printed
     assert "\n" not in printed
+    assert not list(tmp_path.glob("a.mp4")) + list(tmp_path.glob("avatar.mp4")) + list(tmp_path.glob(".*"))
+
+
+@pytest.mark.parametrize("damage", ["config.json", "avatar.safetensors", "surface.npz", ""])
+def test_an_avatar_that_is_not_whole_is_one_line(head, folder, tmp_path, capsys, damage):
+    yawn(head).save(tmp_path / "yawn.npz")
+    if damage:
+        shutil.copytree(folder, tmp_path / "model")
+        path = tmp_path / "model" / damage
+        path.write_bytes(path.read_bytes()[:-40])
+    words = ("avatar", "render", tmp_path / "model", "--motion", tmp_path / "yawn.npz")
+    assert run(*words, "-o", tmp_path / "a.mp4") == 2
+    printed = capsys.readouterr().err.strip()
+    assert str(tmp_path / "model") in printed
+    assert "\n" not in printed
+    assert not (tmp_path / "a.mp4").exists()
