@@ -119,7 +119,8 @@ def _sequence(avatar: Avatar, options: RenderOptions) -> MeshSequence:
         if options.motion.suffix.lower() == ".csv":
             sequence = BlendshapeTrack.load(options.motion).animate(avatar.head)
         else:
-            sequence = replace(MeshSequence.load(options.motion), audio=speech)
+            sequence = MeshSequence.load(options.motion)
+        sequence = replace(sequence, audio=speech)
         fps = options.performance.fps
         return sequence if fps is None else sequence.resampled(fps)
     assert speech is not None

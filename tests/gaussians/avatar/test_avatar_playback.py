@@ -20,6 +20,7 @@ from meshanim.gaussians.camera_paths import camera_path
 from meshanim.geometry import decimate
 from meshanim.heads import HeadParameters, load_head
 from meshanim.motion import MeshSequence
+from meshanim.motion.blendshape_track import BlendshapeTrack
 from meshanim.render import head_camera
 from meshanim.render.lighting import backdrop, developed
 from meshanim.render.look import find_person, make_appearance
@@ -134,6 +135,12 @@ def test_the_command_plays_motion_with_sound(head, folder, tmp_path):
         assert len(file.streams.audio) == 1
     assert np.shape(pictures) == (5, 32, 32, 3)
     assert pictures[0][0, 0].tolist() == pytest.approx([0, 0, 255], abs=12)
+    track = BlendshapeTrack(("jawOpen",), np.linspace(0, 1, 3, dtype=np.float32)[:, None], 30.0)
+    track.save(tmp_path / "yawn.csv")
+    recorded = (*words[:4], tmp_path / "yawn.csv", *words[5:], "--audio", tmp_path / "a.wav")
+    assert run(*recorded, "-o", tmp_path / "weights.mp4") == 0
+    with av.open(str(tmp_path / "weights.mp4")) as file:
+        assert len(file.streams.audio) == 1
     out = tmp_path / "yawn.png"
     assert run(*words, "--background", 1, 0, 0, "-o", out) == 0
     sheet = Image.open(out)
