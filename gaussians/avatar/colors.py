@@ -4,7 +4,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from meshanim.errors import BackendError, OptionError
+from meshanim.gaussians.avatar.colors_native import available, color_network
+
 __all__ = ["ExpressionColors"]
+
+BACKENDS = ("auto", "native", "reference")
 
 
 class ExpressionColors(nn.Module):
@@ -29,13 +34,49 @@ class ExpressionColors(nn.Module):
         self.outer = nn.Parameter(torch.randn(hidden, 3) * 0.01)
 
     def forward(
-        self, latents: Float[Tensor, "n latent"], expression: Float[Tensor, "batch expression"]
+        self,
+        latents: Float[Tensor, "n latent"],
+        expression: Float[Tensor, "batch expression"],
+        backend: str = "auto",
     ) -> Float[Tensor, "batch n 3"]:
-        """Residual of the colours."""
+        """Residual of the colours.
+
+        Parameters
+        ----------
+        latents : (N, L) float
+            Of the Gaussians.
+        expression : (B, E) float
+            Of the frames.
+        backend : str
+            "native" (C++, CPU, float32), "reference" (torch: any device and type) or "auto": native where it
+            is built and applies.
+
+        Raises
+        ------
+        OptionError, BackendError
+            An unknown backend; one that is not there.
+        """
         frame = expression @ self.by_expression + self.bias
-        if len(frame) == 1:
-            hidden = torch.relu(torch.addmm(frame[0], latents, self.by_latent))
-            hidden = torch.relu(torch.addmm(self.inner_bias, hidden, self.inner))
-            return (hidden @ self.outer)[None]
-        hidden = torch.relu((latents @ self.by_latent) + frame[:, None])
+        if _choose(backend, latents) == "native":
+            return color_network(latents, frame, self.by_latent, self.inner, self.inner_bias, self.outer)
+        hidden = torch.relu(latents @ self.by_latent + frame[:, None])
         return torch.relu(hidden @ self.inner + self.inner_bias) @ self.outer
+
+
+def _choose(backend: str, latents: Tensor) -> str:
+    if backend not in BACKENDS:
+        raise OptionError(f"backend {backend!r} is not one of {', '.join(BACKENDS)}")
+    fits = latents.device.type == "cpu" and latents.dtype == torch.float32
+    if backend == "auto":
+        return "native" if available() and fits else "reference"
+    if backend == "native" and not available():
+        raise BackendError(
+            "backend 'native' is not built: install meshanim with a C++17 compiler at hand, "
+            "or use backend='reference'"
+        )
+    if backend == "native" and not fits:
+        raise BackendError(
+            f"backend 'native' computes float32 on the CPU, not {latents.dtype} on {latents.device}: "
+            "use backend='reference' or 'auto'"
+        )
+    return backend

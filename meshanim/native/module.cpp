@@ -31,6 +31,7 @@ Isa current_isa() { return selected(); }
 void bind_attention(nb::module_ &m);
 void bind_binding(nb::module_ &);
 void bind_boxqp(nb::module_ &);
+void bind_colors(nb::module_ &);
 void bind_image(nb::module_ &);
 void bind_memory(nb::module_ &);
 void bind_noise(nb::module_ &);
@@ -52,6 +53,7 @@ NB_MODULE(_native, m) {
     bind_attention(m);
     bind_binding(m);
     bind_boxqp(m);
+    bind_colors(m);
     bind_image(m);
     bind_memory(m);
     bind_noise(m);
