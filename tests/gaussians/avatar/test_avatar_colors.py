@@ -48,7 +48,7 @@ def run(network, latents, expression, backend: str):
 
 # One tile and a part, several chunks, no row; widths that are and are not whole vectors.
 @pytest.mark.parametrize(
-    "count, frames, latent, hidden",
+    ("count", "frames", "latent", "hidden"),
     [(1, 1, 8, 32), (70, 3, 8, 32), (3000, 1, 8, 32), (2048, 2, 5, 19), (90, 1, 17, 40), (64, 2, 1, 1)],
 )
 def test_equals_the_reference(instruction_set, count, frames, latent, hidden):
@@ -74,7 +74,6 @@ def test_no_gaussians_and_no_gradient_asked_for(instruction_set):
 def test_the_same_bits_for_any_number_of_threads(threads):
     network, latents, expression = scene(5000, 2)
     inputs = network.float(), latents.float(), expression.float()
-    # The torch part of the first layer is the same for all: one frame's few numbers.
     results = []
     for count in (1, 2, 3):
         threads(count)
@@ -103,6 +102,6 @@ def test_backends_are_named():
     network, latents, expression = scene(4, 1)
     with pytest.raises(OptionError, match="auto, native, reference"):
         network(latents, expression, backend="cuda")
-    with pytest.raises(BackendError, match="float32 on the CPU, not torch.float64"):
+    with pytest.raises(BackendError, match=r"float32 on the CPU, not torch\.float64"):
         network(latents, expression, backend="native")
     assert torch.equal(network(latents, expression), network(latents, expression, backend="reference"))
