@@ -1,7 +1,8 @@
 """`Animator`: speech to an animated head, whole files and streams through one path."""
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
+from functools import cached_property
 from importlib.resources import files
 from pathlib import Path
 from typing import NamedTuple
@@ -10,6 +11,7 @@ import numpy as np
 import soxr
 import torch
 from jaxtyping import Float, Float32
+from torch import Tensor
 from tqdm import tqdm
 
 from meshanim.audio import SpeechEncoder, Waveform, load_encoder, load_waveform
@@ -20,14 +22,17 @@ from meshanim.heads import Head, load_head
 from meshanim.models.gava import Gava
 from meshanim.models.loading import load_network
 from meshanim.motion import MeshSequence
-from meshanim.motion.animation_state import FacePose, posed_face
-from meshanim.motion.idle import IdleMotion
+from meshanim.motion.animation_state import FacePose, face_pose, posed_face
+from meshanim.motion.face_parts import FaceParts, face_parts
+from meshanim.motion.idle import IdleMotion, gaze_angles
 from meshanim.motion.lip_seal import LipSeal, head_lip_seal
+from meshanim.motion.post_processing import PostHearing, PostProcessor, head_poses
 from meshanim.performance import AnimationOptions, Network, Performance, perform
 
 __all__ = ["AnimationOptions", "AnimationStream", "Animator", "Frames"]
 
 Template = Float[np.ndarray, "vertices 3"]
+Weights = Mapping[str, np.ndarray]
 CHECKPOINTS = {"default": "gava-default"}
 
 
@@ -50,12 +55,33 @@ class AnimationStream:
         wanted = animator.encoder.sample_rate
         self._resample = soxr.ResampleStream(rate, wanted, 1, "float32") if rate != wanted else None
         self._performance = animator.perform(options, template)
-        self._parts = None if isinstance(animator.model, Gava) else animator.model.actors.basis.parts
         self.fps = self._performance.fps
         self._template = template
-        self._idle = IdleMotion(options.seed, options.blinks, options.gaze, options.sway)
         self._given = 0
         self._samples = 0
+        track = options.track
+        blinks, gaze_seed = 0.28, options.seed
+        self._parts = animator.parts
+        self._hearing, self._post = None, None
+        if track is not None:
+            if self._parts is None:
+                raise OptionError("this head has no regions that say what is skin: no post-processing")
+            interval = track.first.blink_interval
+            blinks, gaze_seed = (
+                1 / interval if interval else 0.0,
+                gaze_seed + int(track.first.eye_saccade_seed),
+            )
+            self._hearing = PostHearing(track, wanted)
+            poses = head_poses(animator.model_head, self._parts)
+            self._post = PostProcessor(track, self._parts, self._performance.template, self.fps, poses)
+        if options.blinks is not None:
+            blinks = options.blinks
+        self._idle = IdleMotion(options.seed, blinks, options.gaze, options.sway, gaze_seed)
+
+    @property
+    def without_effect(self) -> tuple[str, ...]:
+        """Controls of the post-processing that this head cannot follow."""
+        return () if self._post is None else self._post.without_effect
 
     def push(self, samples: Float[np.ndarray, " samples"]) -> Frames:
         """Take the next samples, any number of them; give the frames that they complete (maybe none).
@@ -83,6 +109,8 @@ class AnimationStream:
     def _advance(self, samples: np.ndarray, last: bool) -> Frames:
         if self._resample is not None:
             samples = self._resample.resample_chunk(samples, last=last)
+        if self._hearing is not None:
+            samples = self._hearing.push(samples, last)
         motion = self._performance.push(samples, self._total() if last else None)
         pose = motion.pose.cpu().numpy()
         times = (self._given + np.arange(len(pose)) + 0.5) / self.fps
@@ -90,11 +118,33 @@ class AnimationStream:
         pose = pose + self._idle.pose(times)
         weights = self._idle.weights(times, pose)
         face = motion.face
+        if self._post is not None:
+            face, weights = self._processed(face, times, weights)
         if isinstance(face, FacePose):
             assert self._parts is not None
             face = posed_face(self._parts, face, self._performance.template)
         vertices = self._animator.finished(face.cpu().numpy(), weights, self._template)
         return Frames(vertices, pose.astype(np.float32))
+
+    def _processed(
+        self, face: FacePose | Tensor, times: np.ndarray, weights: Weights
+    ) -> tuple[FacePose, Weights]:
+        """Through the post-processing; the weights that are still to be added."""
+        assert self._post is not None
+        assert self._parts is not None
+        if not isinstance(face, FacePose):
+            face = face_pose(self._parts, face, self._performance.template)
+        saccades = gaze_angles(weights)
+        names = () if self._animator.model_head is None else self._animator.model_head.expression_names
+        if set(weights) <= set(names):
+            # The head's own shapes move the lids with the eyes.
+            gain = self._post.track.values("saccade_strength", times)
+            saccades = np.zeros_like(saccades)
+            blink = ("eyeBlinkLeft", "eyeBlinkRight")
+            rest = {name: gain * weight for name, weight in weights.items() if name not in blink}
+        else:
+            rest = {}
+        return self._post(face, times, weights["eyeBlinkLeft"], saccades), rest
 
     @property
     def mesh(self) -> TriangleMesh:
@@ -197,6 +247,13 @@ class Animator:
     def bilabial(self) -> int | None:
         """Which feature is the probability of p, b or m; None if the encoder has no such class."""
         return getattr(self.encoder, "bilabial", None)
+
+    @cached_property
+    def parts(self) -> FaceParts | None:
+        """What is skin, tongue, jaw and eyes of the network's face; None where nothing says it."""
+        if not isinstance(self.model, Gava):
+            return self.model.actors.basis.parts
+        return None if self.model_head is None else face_parts(self.model_head)
 
     def lip_seal(self) -> LipSeal | None:
         """The seal of the network's head; None where the head names no lip pairs or the encoder no class."""
@@ -325,7 +382,7 @@ class Animator:
     ) -> Float32[np.ndarray, "frames vertices 3"]:
         """Add eye weights where the head has those shapes, and carry the frames over to another head."""
         head = self.model_head
-        if head is not None and len(vertices) and "eyeBlinkLeft" in head.expression_names:
+        if head is not None and len(vertices) and weights and set(weights) <= set(head.expression_names):
             rows = [head.expression_names.index(name) for name in weights]
             amounts = torch.from_numpy(np.stack(list(weights.values()), 1).astype(np.float32))
             moved = (amounts @ head.expression_directions[rows]).reshape(len(vertices), -1, 3)

@@ -31,6 +31,8 @@ from meshanim.models.gava import Gava
 from meshanim.models.gava_stream import GavaStream
 from meshanim.motion.animation_state import FacePose
 from meshanim.motion.lip_seal import LipSeal
+from meshanim.motion.post_files import load_post_settings, post_track
+from meshanim.motion.post_processing import PostProcessing, PostTrack
 
 __all__ = ["AnimationOptions", "Motion", "Network", "Performance", "emotion_track", "perform"]
 
@@ -54,7 +56,7 @@ class AnimationOptions:
         Of the emotion, 0 to 1.
     emotion_keys : sequence of str
         Emotions over time, Audio2Face only: 0:joy=1 2.5:anger=0.4,fear=0.2 (seconds, strengths between which
-        it is linear), or 0:SENTENCE.
+        it is linear), or 0:SENTENCE; or one .yml of NVIDIA's with a list of them.
     implicit : str, optional
         CLIP or CLIP:FRAME of training whose implicit emotion is taken, Audio2Face's regression only; the mean
         of the emotion's frames if not given.
@@ -62,12 +64,18 @@ class AnimationOptions:
         Denoising steps, Audio2Face's diffusion only; the network's if not given.
     seed : int
         Of blinks, gaze and sway, and of the noise that diffusion begins with.
-    blinks : float
-        Blinks a second that are added, on heads that have ARKit's eye shapes; 0 for none.
+    blinks : float, optional
+        Blinks a second that are added, on heads that have ARKit's eye shapes; 0 for none; 0.28 if not given,
+        or by the post-processing's `blink_interval`.
     gaze, sway : float
         Gains on added shifts of gaze and on the added slow movement of the head; 0 for none.
     seal : bool
         Whether lips are closed where the encoder hears p, b or m, on heads that name lip pairs; GAVA only.
+    post : str, optional
+        Post-processing: neutral, sdk, framework, framework-diffusion, claire, james, mark; or a file of
+        NVIDIA's, .yml or model_config.json, or one with keyframes.
+    controls : PostProcessing or PostTrack, optional
+        The same from Python.
     emotions : EmotionTrack, optional
         Emotions over time, or a row for each frame, instead of the three options above.
     noise : (steps, T, numbers), optional
@@ -82,12 +90,29 @@ class AnimationOptions:
     implicit: str | None = None
     steps: int | None = None
     seed: int = 0
-    blinks: float = 0.28
+    blinks: float | None = None
     gaze: float = 1.0
     sway: float = 1.0
     seal: bool = True
+    post: str | None = None
+    controls: Annotated[PostProcessing | PostTrack | None, tyro.conf.Fixed, tyro.conf.Suppress] = None
     emotions: Annotated[EmotionTrack | None, tyro.conf.Fixed, tyro.conf.Suppress] = None
     noise: Annotated[Tensor | None, tyro.conf.Fixed, tyro.conf.Suppress] = None
+
+    @property
+    def track(self) -> PostTrack | None:
+        """Post-processing over time; None for none.
+
+        Raises
+        ------
+        OptionError, FileFormatError
+            If it is given twice, or cannot be read.
+        """
+        if self.controls is not None and self.post is not None:
+            raise OptionError("give post-processing by name or file (post), or as controls, not both")
+        if self.controls is not None:
+            return PostTrack.of(self.controls)
+        return None if self.post is None else post_track(self.post)
 
 
 class Motion(NamedTuple):
@@ -321,6 +346,10 @@ def emotion_track(
     """
     if options.emotions is not None:
         return options.emotions
+    if len(options.emotion_keys) == 1 and options.emotion_keys[0].endswith((".yml", ".yaml")):
+        listed = load_post_settings(options.emotion_keys[0]).emotions
+        felt = [(time, {name: by for name, by in named.items() if by}) for time, named in listed]
+        return EmotionTrack.of(network.config.emotions, *felt)
     keys = _keys(options.emotion_keys)
     if isinstance(network, Audio2FaceDiffusion) and network.config.text:
         sentences = keys or [(0.0, options.emotion)]

@@ -111,6 +111,10 @@ def perform(options: AnimateOptions) -> tuple["Scene", MeshSequence]:
     if options.sound is not None:
         raise OptionError("--sound goes with motion from a .csv or .npz; a sound file is its own")
     speech = load_waveform(options.speech, rate=None)
+    if options.performance.track is not None:
+        stream = animator.open(speech.rate, options.performance, scene.template)
+        if stream.without_effect:
+            print(f"this head does not follow {', '.join(stream.without_effect)}", file=sys.stderr)
     sequence = animator(speech, options.performance, scene.template, progress=sys.stderr.isatty())
     return scene, sequence
 

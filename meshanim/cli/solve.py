@@ -16,6 +16,7 @@ from meshanim.motion.audio2face_rig import read_solver_config
 from meshanim.motion.blendshape_csv import CsvForm
 from meshanim.motion.blendshape_solver import SolverOptions
 from meshanim.motion.personal_shapes import Method
+from meshanim.motion.post_files import load_post_settings
 from meshanim.motion.solve_sequence import arkit_only, head_for, solve_sequence
 from meshanim.motion.vertex_sampling import sample_vertices
 
@@ -45,7 +46,8 @@ class SolveOptions:
     samples: int | None = None
     """How many vertices to look at; all that shapes move if not given."""
     config: Path | None = None
-    """Options from the JSON of an Audio2Face-3D rig, instead of the ones below."""
+    """Options from the JSON of an Audio2Face-3D rig, instead of the ones below; or multipliers and offsets
+    from a .yml of its post-processing, beside them."""
     replay: Path | None = None
     """Also write the motion that the weights make, .npz."""
     replay_head: str | None = None
@@ -68,7 +70,14 @@ def solve(options: SolveOptions) -> None:
     sequence = MeshSequence.load(options.motion)
     head = head_for(sequence, load_head(options.head), options.method)
     terms = options.terms
-    if options.config is not None:
+    if options.config is not None and options.config.suffix.lower() in (".yml", ".yaml"):
+        settings = load_post_settings(options.config)
+        scales, added = (
+            {name: by for name, by in values.items() if name in head.expression_names}
+            for values in (settings.multipliers, settings.offsets)
+        )
+        terms = replace(terms, multipliers=scales, offsets=added)
+    elif options.config is not None:
         count = len(sample_vertices(head, options.samples).vertices)
         terms = read_solver_config(options.config, head.expression_names, count)
         terms = replace(terms, nvidia_parity=options.terms.nvidia_parity)

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from meshanim.errors import OptionError
 
-__all__ = ["GAZE_RANGE", "IdleMotion", "gaze_weights", "lid_closure", "saccade", "smoothstep"]
+__all__ = ["GAZE_RANGE", "IdleMotion", "gaze_angles", "gaze_weights", "lid_closure", "saccade", "smoothstep"]
 
 GAZE_RANGE = (0.17, 0.235)
 """Radians that an eye of the default head turns at an eyeLook weight of 1: up or down, and sideways."""
@@ -65,6 +65,15 @@ def gaze_weights(
     }
 
 
+def gaze_angles(
+    weights: Mapping[str, Float[np.ndarray, " frames"]],
+) -> Float[np.ndarray, "frames 2"]:
+    """Pitch and yaw that `gaze_weights` were made of, where none was cut at 1."""
+    pitch = weights["eyeLookDownLeft"] - weights["eyeLookUpLeft"]
+    yaw = weights["eyeLookOutLeft"] - weights["eyeLookInLeft"]
+    return np.stack([pitch * GAZE_RANGE[0], yaw * GAZE_RANGE[1]], axis=1)
+
+
 class IdleMotion:
     """Blinks, gaze and sway as functions of time.
 
@@ -78,6 +87,8 @@ class IdleMotion:
         Gain on shifts of gaze; 0 keeps the eyes still.
     sway : float
         Gain on the movement of the head; 0 keeps it still.
+    gaze_seed : int, optional
+        Of the shifts of gaze; `seed` if not given.
 
     Raises
     ------
@@ -85,12 +96,19 @@ class IdleMotion:
         If a rate or gain is negative.
     """
 
-    def __init__(self, seed: int = 0, blinks: float = 0.28, gaze: float = 1.0, sway: float = 1.0):
+    def __init__(
+        self,
+        seed: int = 0,
+        blinks: float = 0.28,
+        gaze: float = 1.0,
+        sway: float = 1.0,
+        gaze_seed: int | None = None,
+    ):
         if min(blinks, gaze, sway) < 0:
             raise OptionError(f"blinks, gaze and sway must not be negative, not {blinks}, {gaze}, {sway}")
         self.blinks, self.gaze, self.sway = blinks, gaze, sway
         self._lids = np.random.default_rng([seed, 1])
-        self._eyes = np.random.default_rng([seed, 2])
+        self._eyes = np.random.default_rng([seed if gaze_seed is None else gaze_seed, 2])
         self._blinks: list[tuple[float, float]] = []  # time, how far the lids close
         self._shifts: list[tuple[float, float, float]] = [(-1.0, 0.0, 0.0)]  # time, new pitch, new yaw
         head = np.random.default_rng([seed, 3])

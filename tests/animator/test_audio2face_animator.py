@@ -1,5 +1,7 @@
 """Audio2Face's networks through the animator: offline and streaming, what can be chosen, what is refused."""
 
+from dataclasses import replace
+
 import av
 import numpy as np
 import pytest
@@ -18,6 +20,8 @@ from meshanim.cli import main
 from meshanim.errors import FileFormatError, OptionError, ShapeError
 from meshanim.heads import load_head
 from meshanim.models.audio2face import EmotionTrack, FrameNoise, animate_diffusion, animate_regression
+from meshanim.motion import MeshSequence
+from meshanim.motion.post_processing import PRESETS, PostProcessing, PostTrack
 
 STILL = {"blinks": 0.0, "gaze": 0.0, "sway": 0.0}
 MAKERS = {"regression": head_regression, "diffusion": head_diffusion}
@@ -277,3 +281,104 @@ def test_another_head_by_correspondence(tmp_path):
     theirs = animator(noise(0.6), still, other)
     np.testing.assert_allclose(theirs.vertices - other, sequence.vertices - mesh.vertices, atol=1e-5)
     np.testing.assert_allclose(theirs.mesh.vertices, other, atol=1e-7)
+
+
+# -- post-processing -------------------------------------------------------------------------------------
+
+MOVING = PostTrack(
+    (0.2, 1.0),
+    (
+        PostProcessing(prediction_delay=0.1, lower_face_smoothing=0.05, face_mask_level=0.4),
+        PostProcessing(
+            prediction_delay=0.1, input_strength=2.0, upper_face_smoothing=0.03, face_mask_level=0.5,
+            skin_strength=1.5, right_eye_rot_y_offset=9.0, blink_strength=0.5,
+        ),
+    ),
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def three(animators):
+    return animators | {"gava": Animator.from_pretrained("default")}
+
+
+@pytest.mark.parametrize("kind", [*MAKERS, "gava"])
+def test_post_processing_of_a_stream_is_that_of_the_file(three, kind):
+    options = AnimationOptions(controls=MOVING, blinks=1.0, seed=2)
+    waveform = noise(1.6)
+    whole = three[kind](waveform, options)
+    stream = three[kind].open(16000, options)
+    assert stream.without_effect == ()
+    parts = [stream.push(block) for block in np.split(waveform.samples, [100, 9000, 9001, 20000])]
+    parts.append(stream.finish())
+    np.testing.assert_allclose(np.concatenate([p.vertices for p in parts]), whole.vertices, atol=2e-6)
+    assert np.abs(whole.vertices - three[kind](waveform, AnimationOptions(seed=2)).vertices).max() > 1e-3
+
+
+@pytest.mark.parametrize("kind", [*MAKERS, "gava"])
+def test_neutral_post_processing_leaves_frames_as_they_are(three, kind):
+    options = {"blinks": 0.7, "seed": 5}
+    plain = three[kind](noise(2.5), AnimationOptions(**options))
+    neutral = three[kind](noise(2.5), AnimationOptions(**options, post="neutral"))
+    skin = head_actors().basis.parts.skin
+    np.testing.assert_allclose(neutral.vertices[:, skin], plain.vertices[:, skin], atol=1e-6)
+    # Eyeballs and lower teeth become rigid; GAVA's are so nearly.
+    np.testing.assert_allclose(neutral.vertices, plain.vertices, atol=1e-6 if kind in MAKERS else 2e-3)
+
+
+def test_controls_move_what_they_are_named_after(three):
+    parts, waveform = head_actors().basis.parts, noise(1.0)
+
+    def moved(kind, **controls):
+        two = (
+            three[kind](waveform, AnimationOptions(**STILL, controls=replace(PRESETS["neutral"], **each)))
+            for each in ({}, controls)
+        )
+        plain, other = (sequence.vertices for sequence in two)
+        return other - plain
+
+    for kind in three:
+        lips = moved(kind, lip_open_offset=0.2)
+        upper, lower = np.split(lips[:, parts.lip_pairs, 1].mean((0, 1)), 2)
+        assert upper > 1e-4 > -1e-4 > lower
+        lids = moved(kind, eyelid_open_offset=-1.0)
+        upper, lower = np.split(lids[:, parts.lid_pairs, 1].mean((0, 1)), 2)
+        assert upper - lower < -2e-3
+        assert not lids[:, parts.tongue].any()
+        np.testing.assert_allclose(moved(kind, tongue_height_offset=1.0)[:, parts.tongue, 1], 0.01, atol=1e-6)
+        np.testing.assert_allclose(
+            moved(kind, lower_teeth_depth_offset=0.5)[:, parts.jaw_rigid, 2], 0.005, atol=1e-5
+        )
+        right = moved(kind, right_eye_rot_x_offset=10.0)
+        front = parts.right_eye[int(head_actors().templates["anna"][parts.right_eye, 2].argmax())]
+        assert right[:, front, 1].max() < -1e-3
+        assert np.abs(right[:, parts.left_eye]).max() < 1e-6
+
+
+def test_post_processing_on_the_command_line(tmp_path, capsys):
+    soundfile.write(tmp_path / "a.wav", noise(0.3).samples, 16000)
+    (tmp_path / "c.yml").write_text(
+        "face_parameters: {skinStrength: 1.5}\nemotion_with_timecode_list: {a: {time_code: 0, emotions: "
+        "{joy: 1.0, fear: 0.0}}}\n"
+    )
+    head_regression().save_pretrained(tmp_path / "model")
+
+    def run(*words):
+        given = ("animate", tmp_path / "a.wav", "-o", tmp_path / "a.npz", "--blinks", 0, "--head", "own")
+        return main([str(word) for word in (*given, *words)])
+
+    post = ("--model", tmp_path / "model", "--post", tmp_path / "c.yml")
+    assert run(*post, "--emotion-keys", tmp_path / "c.yml") == 0
+    animator = Animator.from_pretrained(tmp_path / "model")
+    options = AnimationOptions(blinks=0, controls=PostProcessing(skin_strength=1.5), emotion="joy")
+    template = MeshSequence.load(tmp_path / "a.npz").mesh.vertices.astype(np.float32)
+    np.testing.assert_allclose(
+        MeshSequence.load(tmp_path / "a.npz").vertices,
+        animator(tmp_path / "a.wav", options, template).vertices,
+        atol=1e-6,
+    )
+    capsys.readouterr()
+    (tmp_path / "c.yml").write_text("face_parameters: {skinStrength: 15}")
+    for words, named in ((post, "skin_strength is 15"), (("--post", "clair"), "claire")):
+        assert run(*words) == 2
+        assert named in capsys.readouterr().err
