@@ -226,12 +226,13 @@ class Capture:
         head = load_head(self.head_name)
         if self.static_offset is None:
             return head
-        if self.static_offset.shape != (head.n_vertices, 3):
+        try:
+            return head.with_offset(torch.from_numpy(self.static_offset))
+        except ShapeError as error:
             raise ShapeError(
                 f"{self.directory} has offsets of {len(self.static_offset)} vertices, head {self.head_name} "
                 f"has {head.n_vertices}"
-            )
-        return head.with_offset(torch.from_numpy(self.static_offset))
+            ) from error
 
     def at(self, timesteps: int | Sequence[int] | Int[np.ndarray, " timesteps"]) -> HeadParameters:
         """Head parameters of some timesteps.

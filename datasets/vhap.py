@@ -4,12 +4,15 @@
     DIR/images/TTTTT_CC.png           file_path
     DIR/fg_masks/TTTTT_CC.png         fg_mask_path
     DIR/flame_param/TTTTT.npz         flame_param_path: translation, rotation, neck_pose, jaw_pose (1, 3),
-                                      eyes_pose (1, 6), shape (300,), expr (1, 100), static_offset (1, V, 3)
+                                      eyes_pose (1, 6), shape (300,), expr (1, 100), static_offset (1, V, 3);
+                                      dynamic_offset (1, V, 3) is not read, as GaussianAvatars does not
     DIR/canonical_flame_param.npz     the same at rest, jaw opened by 0.3 rad
     DIR/surface.npz                   ours alone: the drawn triangles (`HeadSurface`), if not the head's own
 
 Each frame has `transform_matrix`, camera to world in OpenGL axes (x right, y up, z backwards), metres.
-Combined data sets name their files relative to DIR, "../SEQUENCE/images/...". `val` is a camera that was left
+Combined data sets name their files relative to DIR, "../SEQUENCE/images/..."; each of their sequences was
+tracked for itself, and the first one's identity (shape, static_offset) is taken for all, as GaussianAvatars
+does. `val` is a camera that was left
 out (8, the front, of 16), `test` a sequence that was. Names and types are those of VHAP's
 export_as_nerf_dataset.py and combine_nerf_datasets.py.
 """
@@ -30,7 +33,7 @@ from meshanim.datasets.capture import Capture, Picture, View, check_camera, read
 from meshanim.datasets.capture_folder import write_image
 from meshanim.errors import FileFormatError, OptionError
 from meshanim.files import read_json, read_npz, written_whole
-from meshanim.heads import HeadParameters, HeadSurface
+from meshanim.heads import HeadParameters, HeadSurface, load_head
 
 __all__ = ["detect", "read_capture", "write_vhap"]
 
@@ -115,6 +118,9 @@ def read_capture(directory: Path) -> Capture:
         images[view.name] = image
         if mask is not None:
             masks[view.name] = mask
+    if masks and len(masks) < len(views):
+        absent = next(view.name for view in views if view.name not in masks)
+        raise FileFormatError(f"{directory}: some frames have fg_mask_path, others, such as {absent}, none")
     parameters, offset = _read_parameters(directory, [key[1] for key in keys]) if files else (None, None)
     views.sort(key=lambda view: (view.timestep, view.camera))
     return Capture(
@@ -140,6 +146,12 @@ def _read_frames(path: Path) -> list[tuple[dict[str, Any], dict[str, Any]]]:
     if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
         raise FileFormatError(f"{path} holds no frames")
     shared = {key: value for key, value in content.items() if key != "frames"}
+    listed = content.get("timestep_indices")
+    if isinstance(listed, list):
+        numbers = [frame.get("timestep_index") for frame in content["frames"]]
+        other = [number for number in numbers if isinstance(number, int) and number not in listed]
+        if other:
+            raise FileFormatError(f"{path} has frames of timestep {other[0]}, which timestep_indices lacks")
     return [(shared, frame) for frame in content["frames"]]
 
 
@@ -188,7 +200,7 @@ def _focal(frame: Mapping[str, Any], axis: str, size: int) -> float:
 
 def _read_parameters(directory: Path, files: Sequence[str]) -> tuple[HeadParameters, np.ndarray | None]:
     rows: dict[str, list[np.ndarray]] = {ours: [] for ours, _ in PARAMETERS.values()}
-    offset: np.ndarray | None = None
+    identities: dict[Path, tuple[np.ndarray, np.ndarray | None]] = {}  # of each sequence
     for file in files:
         path = directory / file
         arrays = read_npz(path)
@@ -203,21 +215,27 @@ def _read_parameters(directory: Path, files: Sequence[str]) -> tuple[HeadParamet
                     f"{path}: {theirs} has {len(row)} numbers, that of other frames {len(rows[ours][0])}"
                 )
             rows[ours].append(row)
-        if "static_offset" in arrays:
-            found = np.asarray(arrays["static_offset"], np.float32)
-            found = found.reshape(-1, found.shape[-1])
-            if found.shape[1] != 3 or not np.isfinite(found).all():
-                raise FileFormatError(f"{path}: static_offset is {found.shape}, expected (1, V, 3), finite")
-            if offset is not None and not np.array_equal(offset, found):
-                raise FileFormatError(f"{path}: static_offset is not that of the other frames")
-            offset = found
+        identity = rows["shape"][-1], _static_offset(path, arrays)
+        first = identities.setdefault(path.parent, identity)
+        if not all(np.array_equal(one, other) for one, other in zip(first, identity)):
+            raise FileFormatError(f"{path}: shape or static_offset is not that of the other frames")
+    shape, offset = next(iter(identities.values()))
     tensors = {name: torch.from_numpy(np.stack(values)) for name, values in rows.items()}
-    shape = tensors["shape"]
-    if (shape == shape[:1]).all():
-        tensors["shape"] = shape[:1]
+    tensors["shape"] = torch.from_numpy(shape)[None]
     if offset is not None and not offset.any():
         offset = None  # it says nothing about the topology either: teeth may be missing from it
     return HeadParameters(**tensors), offset
+
+
+def _static_offset(path: Path, arrays: Mapping[str, np.ndarray]) -> np.ndarray | None:
+    if "static_offset" not in arrays:
+        return None
+    found = np.asarray(arrays["static_offset"], np.float32)
+    if found.ndim == 3 and len(found) == 1:
+        found = found[0]
+    if found.ndim != 2 or found.shape[1] != 3 or not np.isfinite(found).all():
+        raise FileFormatError(f"{path}: static_offset is {found.shape}, expected (1, V, 3), finite")
+    return found
 
 
 def write_vhap(capture: Capture, target: str | Path, progress: bool = False) -> Path:
@@ -305,8 +323,10 @@ def _write_picture(capture: Capture, index: int, numbers: Mapping[str, int], tar
 def _write_parameters(capture: Capture, target: Path) -> None:
     vertices = capture.head.n_vertices
     offset = np.zeros((1, vertices, 3), np.float32)
-    if capture.static_offset is not None:
+    if capture.static_offset is not None and len(capture.static_offset) == vertices:
         offset[0] = capture.static_offset
+    elif capture.static_offset is not None:  # of another set of teeth
+        offset[0] = capture.head.template_vertices - load_head(capture.head_name).template_vertices
     widths = {"shape": len(capture.head.shape_names), "expression": len(capture.head.expression_names)}
     for row in sorted({view.timestep for view in capture.views}):
         params = capture.at(row)

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -89,7 +89,7 @@ def evaluate_avatar(options: EvaluateAvatarOptions, progress: bool = True) -> Re
             raise OptionError(f"split {split} of {capture.directory} has no pictures")
     if options.examples < 1:
         raise OptionError(f"examples must be at least 1, not {options.examples}")
-    behind, composed = backdrop(capture, "auto")
+    behind, composed = backdrop(capture, avatar.config.background)
     store = PictureStore(capture, behind if composed else None)
     perceptual = None if options.lpips is None else Lpips(options.lpips)
     poses = _Poses(avatar, capture, directory)
@@ -146,7 +146,7 @@ class _Poses:
             return HeadParameters(
                 **{name: rows[timestep : timestep + 1] for name, rows in self.fitted.items()}
             )
-        return self.capture.at(timestep)
+        return replace(self.capture.at(timestep), shape=None)  # the avatar's own
 
     def sideways(self, index: int) -> float:
         """How far from the side of the head a picture was taken: 0 in front (or behind), 1 in profile."""

@@ -112,7 +112,7 @@ def fit_avatar(options: FitAvatarOptions, progress: bool = True) -> Results:
         config,
         load_head(capture.head_name),
         capture.carried,
-        capture.at(0).shape,
+        capture.at(capture.views[views[0]].timestep).shape,
         offset,
         scale=settings.scale,
         opacity=settings.opacity,

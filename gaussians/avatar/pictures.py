@@ -13,34 +13,60 @@ __all__ = ["PictureStore", "backdrop", "scene_radius"]
 
 KEPT = 6 << 30
 """Bytes of decoded pictures that stay in memory."""
+LOOKED_AT, SHARE_AROUND, TOLERANCE = 3, 0.02, 3
+"""To find a plain background: pictures, share of pixels that is not the head, levels of 255 of noise."""
 BACKDROPS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 
 
-def backdrop(capture: Capture, wanted: str) -> tuple[tuple[float, float, float], bool]:
+def backdrop(
+    capture: Capture, wanted: str | tuple[float, float, float]
+) -> tuple[tuple[float, float, float], bool]:
     """What is behind the head, and whether pictures must be put in front of it by their masks.
 
     Parameters
     ----------
     capture : Capture
         Whose.
-    wanted : "auto", "white" or "black"
-        auto: the capture's own where it is plain; else white where there are masks.
+    wanted : "auto", "white", "black" or (3,) float
+        auto: the capture's own where it is plain, as stated or as seen around the masks (VHAP and NeRSemble
+        have put their pictures on a colour; doing so again would thin their edges); else white where there
+        are masks. A colour: that of an avatar.
 
     Raises
     ------
     OptionError
         If there is neither a plain background nor masks.
     """
-    if wanted == "auto" and capture.background is not None:
-        return capture.background, False
-    if wanted not in ("auto", *BACKDROPS):
+    if isinstance(wanted, str) and wanted not in ("auto", *BACKDROPS):
         raise OptionError(f"no background '{wanted}'; there are auto, {', '.join(BACKDROPS)}")
+    plain = capture.background or _plain(capture)
+    color = wanted if isinstance(wanted, tuple) else BACKDROPS.get(wanted)
+    if plain is not None and (color is None or np.allclose(plain, color, atol=1.01 / 255)):
+        return plain, False
     if capture[0].mask is None:
         raise OptionError(
             f"{capture.directory} has no masks, so the head cannot be told from what is behind it: "
             "add masks/, or state the colour of a plain background in capture.json"
         )
-    return BACKDROPS["white" if wanted == "auto" else wanted], True
+    return BACKDROPS["white"] if color is None else color, True
+
+
+def _plain(capture: Capture) -> tuple[float, float, float] | None:
+    """The one colour that some pictures have wherever their masks are empty; None if there is none."""
+    found = []
+    for index in np.linspace(0, len(capture) - 1, LOOKED_AT).astype(int).tolist():
+        picture = capture[index]
+        around = None if picture.mask is None else picture.image[picture.mask == 0].astype(int)
+        if around is None or len(around) < SHARE_AROUND * picture.image.shape[0] * picture.image.shape[1]:
+            return None
+        color = np.median(around, axis=0)
+        if (np.abs(around - color).max(1) > TOLERANCE).mean() > 0.01:
+            return None
+        found.append(color)
+    if np.ptp(found, axis=0).max() > 1:
+        return None
+    red, green, blue = (float(channel) / 255 for channel in np.median(found, axis=0))
+    return red, green, blue
 
 
 def scene_radius(capture: Capture) -> float:

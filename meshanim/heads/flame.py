@@ -15,13 +15,15 @@ from torch import Tensor
 from meshanim.errors import FileFormatError, OptionError
 from meshanim.geometry import TriangleMesh
 from meshanim.heads.flame_regions import flame_regions, regions_from_default
-from meshanim.heads.flame_teeth import FlameArrays, add_teeth, split_teeth
+from meshanim.heads.flame_teeth import FlameArrays, add_teeth, offset_on_teeth, split_teeth
 from meshanim.heads.head import JOINT_PARENTS, Head, HeadParameters
 from meshanim.unpickle import load_npy_objects, load_pickle
 
 __all__ = ["FlameHead", "load_flame"]
 
 N_VERTICES, N_FACES = 5023, 9976
+SHARED_OFFSETS = (5023, 5083, 5143)
+"""Rows of VHAP's static offsets, in all its versions."""
 N_SHAPE, N_EXPRESSION = 300, 100
 TEETH = ("none", "plain", "split")
 YAW_LIMIT = 39
@@ -65,8 +67,15 @@ class FlameHead(Head):
         self.masks = dict(masks)
         self._embedding = {name: np.asarray(value) for name, value in embedding.items()}
 
-    def with_offset(self, offset: Float[Tensor, "vertices 3"]) -> "FlameHead":
-        """The same head with a personal template; its joints are regressed from that, as VHAP does."""
+    def with_offset(self, offset: Float[Tensor, "shared 3"]) -> "FlameHead":
+        """The same head with a personal template; its joints are regressed from that, as VHAP does.
+
+        Offsets that are shared for another set of teeth (5,023, 5,083 or 5,143 rows) fit as well: see
+        `offset_on_teeth`.
+        """
+        if len(offset) != self.n_vertices and len(offset) in SHARED_OFFSETS:
+            carried = offset_on_teeth(offset.detach().cpu().numpy(), self.mesh, N_VERTICES, N_FACES)
+            offset = torch.from_numpy(carried)
         head = super().with_offset(offset)
         assert isinstance(head, FlameHead)
         head.rest_joints = self.rest_joints + self.joint_regressor @ offset.to(self.joint_regressor)

@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 
 from meshanim.geometry import TriangleMesh, split_faces
 
-__all__ = ["FlameArrays", "add_teeth", "split_teeth"]
+__all__ = ["FlameArrays", "add_teeth", "offset_on_teeth", "split_teeth"]
 
 # FLAME's outer lip rings from the subject's left corner to the right one, the same 15 columns in both.
 UPPER_RING = (1713, 1715, 1716, 1735, 1696, 1694, 1657, 3543, 2774, 2811, 2813, 2850, 2833, 2832, 2830)
@@ -98,8 +98,7 @@ def add_teeth(arrays: FlameArrays) -> FlameArrays:
 
 def split_teeth(arrays: FlameArrays) -> FlameArrays:
     """Every triangle of the teeth in four (GaussianSpeech, Sec. 4.1), by the midpoints of its sides."""
-    teeth = np.arange(len(arrays.faces) - len(teeth_faces()), len(arrays.faces))
-    fine = split_faces(TriangleMesh(arrays.vertices, arrays.faces), teeth)
+    fine = _split(arrays.vertices, arrays.faces)
     operator, count = fine.operator, len(arrays.vertices)
 
     def carried(values: np.ndarray) -> np.ndarray:
@@ -115,3 +114,36 @@ def split_teeth(arrays: FlameArrays) -> FlameArrays:
         np.concatenate([arrays.joint_regressor, np.zeros((5, added))], axis=1),
         carried(arrays.weights),
     )
+
+
+def offset_on_teeth(
+    offset: Float[np.ndarray, "shared 3"], mesh: TriangleMesh, head_vertices: int, head_faces: int
+) -> Float[np.ndarray, "vertices 3"]:
+    """Offsets that were shared for FLAME without teeth, with fewer or with other ones, on a head's vertices.
+
+    Teeth that the offsets lack stay where they are (GaussianAvatars pads with zeros), those that the head
+    lacks are left out, and split ones take the means of their sides.
+
+    Parameters
+    ----------
+    offset : (W, 3)
+        One a vertex of FLAME, then of teeth: 5,023, 5,083 or 5,143 rows.
+    mesh : TriangleMesh
+        The head.
+    head_vertices, head_faces : int
+        Of FLAME without teeth.
+    """
+    count, plain = mesh.n_vertices, head_vertices + len(ROWS) * COLUMNS
+    padded = np.zeros((max(plain, len(offset)), 3), offset.dtype)
+    padded[: len(offset)] = offset
+    if count <= plain:
+        return padded[:count]
+    faces = np.concatenate([mesh.faces[:head_faces], teeth_faces() + head_vertices])
+    operator = _split(mesh.vertices[:plain], faces).operator
+    return (operator @ padded[:plain]).astype(offset.dtype)
+
+
+def _split(vertices: np.ndarray, faces: np.ndarray):
+    """A mesh whose last triangles, the teeth, are split in four."""
+    teeth = np.arange(len(faces) - len(teeth_faces()), len(faces))
+    return split_faces(TriangleMesh(vertices, faces), teeth)

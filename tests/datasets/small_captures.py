@@ -154,9 +154,11 @@ def combined_vhap(root) -> None:
             frame["timestep_index"] += start
             for key in ("file_path", "flame_param_path", "fg_mask_path"):
                 frame[key] = f"../{sequence}/{frame[key]}"
+        indices = [start + timestep for timestep in content["timestep_indices"]]
         start += TIMESTEPS
-        kept = tables.setdefault(split, {**content, "frames": []})
+        kept = tables.setdefault(split, {**content, "frames": [], "timestep_indices": []})
         kept["frames"] += content["frames"]
+        kept["timestep_indices"] += indices
     train = tables["train"]
     tables["val"] = {**train, "frames": [f for f in train["frames"] if f["camera_index"] == 2]}
     train["frames"] = [f for f in train["frames"] if f["camera_index"] != 2]

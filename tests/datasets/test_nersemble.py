@@ -92,6 +92,30 @@ def test_splits_and_parameters(mono):
     assert chosen.translation is None
 
 
+def test_the_second_version_of_the_tracking_goes_before_the_first(mono):
+    """Submissions are judged by it; sequences of different versions are not mixed."""
+    folders = sorted((mono / "sequences").iterdir())
+    first = open_capture(mono).parameters.expression
+    for seed, folder in enumerate(folders):
+        np.savez(folder / "tracking" / "flame2023_tracking_v2.npz", **tracking(seed + 10))
+    second = open_capture(mono).parameters.expression
+    assert np.array_equal(second[:FRAMES], tracking(10)["expression"])
+    for folder in folders:
+        (folder / "tracking" / "flame2023_tracking.npz").unlink()
+    assert np.array_equal(open_capture(mono).parameters.expression, second)
+    assert not np.array_equal(first, second)
+    folder = folders[2] / "tracking"
+    (folder / "flame2023_tracking_v2.npz").rename(folder / "flame2023_tracking.npz")
+    with pytest.raises(FileFormatError, match="has no tracking like the others"):
+        open_capture(mono)
+
+
+def test_the_tracking_s_matrices_are_what_its_angles_are_read_as(mono):
+    capture, written = open_capture(mono), tracking(0)
+    turned = np.linalg.inv(small.pose(0)) @ capture.views[5].world_to_camera
+    np.testing.assert_allclose(turned[:3, :3], written["rotation_matrices"][5], atol=1e-6)
+
+
 def test_points_of_the_tracked_head_project_as_the_benchmark_does_it(mono):
     """world = scale R x + t by intrinsic XYZ angles, then the calibrated camera."""
     capture, written = open_capture(mono), tracking(0)
@@ -163,6 +187,12 @@ def spoil_pose(path):
     path.write_text(json.dumps(content))
 
 
+def spoil_intrinsics(path):
+    content = json.loads(path.read_text())
+    del content["intrinsics"]["222200037"]
+    path.write_text(json.dumps(content))
+
+
 TRACK = "sequences/EXP-1-head/tracking/flame2023_tracking.npz"
 CALIBRATION = "calibration/camera_params.json"
 VIDEO = f"sequences/EXP-1-head/images/cam_{MONO_TRAIN_CAMERA}.mp4"
@@ -189,6 +219,15 @@ DAMAGE = {
     ),
     "an untracked sequence": (lambda d: (d / TRACK).unlink(), "EXP-1-head has no tracking"),
     "a video of other length": (lambda d: write_video(d / VIDEO, 7), "has 7 frames"),
+    "a video cut short": (
+        lambda d: (d / VIDEO).write_bytes((d / VIDEO).read_bytes()[:-300]),
+        r"cam_222200037\.mp4",
+    ),
+    "one alpha map less": (
+        lambda d: (d / VIDEO.replace("images", "alpha_maps")).unlink(),
+        "is missing; other videos have alpha maps",
+    ),
+    "no intrinsics": (lambda d: spoil_intrinsics(d / CALIBRATION), "lacks camera 222200037"),
     "no video": (lambda d: (d / VIDEO).write_bytes(b"none"), r"cam_222200037\.mp4"),
     "an empty sequence": (lambda d: (d / "sequences" / "X").mkdir(), "has neither tracking"),
 }
@@ -200,6 +239,13 @@ def test_damage_is_named_on_opening(mono, damage):
     harm(mono)
     with pytest.raises(FileFormatError, match=message):
         open_capture(mono)
+
+
+def test_a_mask_video_that_ends_early_is_named(mono):
+    path = mono / VIDEO.replace("images", "alpha_maps")
+    write_video(path, FRAMES - 3, 1)
+    with pytest.raises(FileFormatError, match=f"ends before frame {FRAMES - 1}"):
+        open_capture(mono)[FRAMES - 1]
 
 
 def test_masks_of_another_size_are_named(mono):

@@ -49,6 +49,32 @@ def test_combined_sequences_and_their_splits(tmp_path):
     assert torch.allclose(moved, torch.full((3, 3), 3.0), atol=1e-6)
 
 
+def test_sequences_that_were_tracked_apart_have_the_first_ones_identity(tmp_path):
+    """Each sequence of a union was tracked for itself; GaussianAvatars takes the identity of timestep 0."""
+    small.combined_vhap(tmp_path)
+    with np.load(tmp_path / "074_EMO-1" / "flame_param" / "00000.npz") as first:
+        shape, offset = first["shape"], first["static_offset"]
+    for number, sequence in enumerate(("074_EXP-2", "074_FREE"), start=1):
+        for path in (tmp_path / sequence / "flame_param").iterdir():
+            with np.load(path) as archive:
+                arrays = dict(archive)
+            arrays["shape"] = arrays["shape"] + np.float32(number)
+            arrays["static_offset"] = arrays["static_offset"] * np.float32(2)
+            np.savez(path, **arrays)
+    capture = open_capture(tmp_path / "UNION")
+    assert np.array_equal(capture.parameters.shape, shape[None])
+    assert np.array_equal(capture.static_offset, offset[0])
+
+
+def test_a_monocular_union_has_no_validation_camera(tmp_path):
+    small.combined_vhap(tmp_path)
+    path = tmp_path / "UNION" / "transforms_val.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"frames": [], "camera_indices": []}))
+    assert {name: len(rows) for name, rows in open_capture(path.parent).splits.items()} == {
+        "train": 12, "val": 0, "test": 9,
+    }  # fmt: skip
+
+
 def test_shared_and_angular_intrinsics(tmp_path):
     content = small.vhap_export(tmp_path)
     for frame in content["frames"]:
@@ -147,6 +173,15 @@ def change(directory, **values):
     path.write_text(json.dumps(content))
 
 
+def drop(directory, key):
+    """Remove it from a frame and from what all frames share."""
+    path = directory / "transforms.json"
+    content = json.loads(path.read_text())
+    content.pop(key, None)
+    content["frames"][4].pop(key)
+    path.write_text(json.dumps(content))
+
+
 def change_parameters(directory, **values):
     path = directory / "flame_param" / "00001.npz"
     with np.load(path) as archive:
@@ -179,6 +214,16 @@ DAMAGE = {
         lambda d: change_parameters(d, static_offset=np.zeros((1, 5, 3))),
         "not that of the other",
     ),
+    "another shape": (lambda d: change_parameters(d, shape=np.zeros(300)), "not that of the other"),
+    "an offset of two frames": (
+        lambda d: change_parameters(d, static_offset=np.zeros((2, 5, 3))),
+        r"static_offset is \(2, 5, 3\)",
+    ),
+    "no camera": (lambda d: drop(d, "transform_matrix"), "00001_01.png lacks 'transform_matrix'"),
+    "no size": (lambda d: drop(d, "w"), "00001_01.png lacks 'w'"),
+    "one mask less": (lambda d: drop(d, "fg_mask_path"), "others, such as 00001_01, none"),
+    "parameters of some": (lambda d: drop(d, "flame_param_path"), "some frames have flame_param_path"),
+    "a timestep too many": (lambda d: change(d, timestep_index=7), "timestep 7, which timestep_indices"),
 }
 
 
@@ -196,7 +241,10 @@ def test_pictures_gone_are_named_when_read(tmp_path):
     (tmp_path / "images" / "00000_01.png").unlink()
     (tmp_path / "fg_masks" / "00000_02.png").unlink()
     small.write_png(tmp_path / "images" / "00001_00.png", np.zeros((2, 2, 3), np.uint8))
+    cut(tmp_path / "images" / "00001_01.png", 120)
+    cut(tmp_path / "fg_masks" / "00001_02.png", 120)
     defects = open_capture(tmp_path).check()
-    assert len(defects) == 3
+    assert len(defects) == 5
     expected = ("images/00000_01.png", "fg_masks/00000_02.png", "2 x 2 pixels")
+    expected += ("images/00001_01.png", "fg_masks/00001_02.png")
     assert all(part in line for part, line in zip(expected, defects))

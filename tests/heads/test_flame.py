@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from meshanim.errors import FileFormatError, OptionError
+from meshanim.errors import FileFormatError, OptionError, ShapeError
 from meshanim.heads import REGION_NAMES, HeadParameters, load_flame, load_head
 
 
@@ -138,6 +138,28 @@ def test_split_teeth_lie_on_the_plain_ones(flame_folder):
     middles = coarse[torch.from_numpy(edges)].mean(1)
     distance = torch.cdist(fine[5143:].double(), middles.double()).min(1).values
     assert distance.max() < 1e-6
+
+
+def test_offsets_shared_for_other_teeth(flame_folder, head):
+    """5,023 rows are FLAME's, then come teeth: missing ones stay, split ones take means, spare ones go."""
+    plain, split = (load_flame(flame_folder / "generic_model.pkl", teeth) for teeth in ("plain", "split"))
+    offset = torch.randn((5143, 3), generator=torch.Generator().manual_seed(0)) * 1e-2
+    for count in (5023, 5083, 5143):
+        moved = plain.with_offset(offset[:count]).template_vertices - plain.template_vertices
+        torch.testing.assert_close(moved[:count], offset[:count], atol=1e-6, rtol=0)
+        assert not moved[count:].any()
+        bare = head.with_offset(offset[:count])
+        torch.testing.assert_close(bare.template_vertices, head.with_offset(offset[:5023]).template_vertices)
+    fine = split.with_offset(offset)
+    torch.testing.assert_close(fine.template_vertices[:5143], plain.with_offset(offset).template_vertices)
+    torch.testing.assert_close(fine.rest_joints, plain.with_offset(offset).rest_joints)
+    coarse, faces = plain.with_offset(offset).template_vertices, plain.mesh.faces[9976:]
+    edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+    middles = coarse[torch.from_numpy(edges)].mean(1)
+    distance = torch.cdist(fine.template_vertices[5143:].double(), middles.double()).min(1).values
+    assert distance.max() < 1e-6
+    with pytest.raises(ShapeError, match="offset must be"):
+        plain.with_offset(offset[:5000])
 
 
 def test_landmarks(head, flame_folder):

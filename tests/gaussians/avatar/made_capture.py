@@ -43,7 +43,7 @@ def made_avatar(head: str, **changes) -> Avatar:
     return avatar.eval()
 
 
-def made_cameras(count: int = CAMERAS, size: int = SIZE) -> Cameras:
+def made_cameras(count: int = CAMERAS, size: int = SIZE, focal: float = 1.7) -> Cameras:
     poses = []
     for angle in np.linspace(-0.8, 0.8, count):
         pose = np.eye(4)
@@ -54,7 +54,7 @@ def made_cameras(count: int = CAMERAS, size: int = SIZE) -> Cameras:
         ]
         pose[2, 3] = 0.5
         poses.append(pose)
-    intrinsics = np.array([[1.7 * size, 0, size / 2], [0, 1.7 * size, size / 2], [0, 0, 1]])
+    intrinsics = np.array([[focal * size, 0, size / 2], [0, focal * size, size / 2], [0, 0, 1]])
     stacked = torch.tensor(np.stack(poses)).float()
     return Cameras(stacked, torch.tensor(intrinsics).float().expand(count, 3, 3), size, size)
 
@@ -64,12 +64,14 @@ def made_parameters(count: int = TIMESTEPS) -> HeadParameters:
     return HeadParameters(expression=torch.cat([steps, steps.flip(0) ** 2], 1))
 
 
-def write_capture(directory: Path, background: bool = True) -> Avatar:
-    """Pictures of `made_avatar`; the last camera is a novel view, the last timestep a novel expression."""
+def write_capture(directory: Path, background: bool = True, focal: float = 1.7) -> Avatar:
+    """Pictures of `made_avatar`; the last camera is a novel view, the last timestep a novel expression.
+
+    With a focal length of 1.7 sizes the ball fills them."""
     directory.mkdir()
     avatar, cameras, parameters = (
         made_avatar(write_rig(directory / "rig.npz")),
-        made_cameras(),
+        made_cameras(focal=focal),
         made_parameters(),
     )
     with torch.no_grad():

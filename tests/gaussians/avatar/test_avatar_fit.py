@@ -263,11 +263,23 @@ def test_a_split_without_pictures_is_left_out_or_named(tmp_path):
         fit(tmp_path / "ball", tmp_path / "run", split="novel_view")
 
 
+def noisy_background(folder: Path) -> None:
+    """Put noise wherever a mask of the capture is empty."""
+    generator = np.random.default_rng(0)
+    for path in sorted((folder / "images").iterdir()):
+        image, mask = np.array(Image.open(path)), np.asarray(Image.open(folder / "masks" / path.name))
+        image[mask == 0] = generator.integers(0, 256, image.shape)[mask == 0]
+        Image.fromarray(image).save(path)
+
+
 def test_pictures_without_a_plain_background_are_put_on_white(tmp_path):
-    write_capture(tmp_path / "ball", background=False)
+    write_capture(tmp_path / "ball", background=False, focal=0.9)
+    noisy_background(tmp_path / "ball")
     capture = open_capture(tmp_path / "ball")
     assert backdrop(capture, "auto") == ((1.0, 1.0, 1.0), True)
     assert backdrop(capture, "black")[0] == (0.0, 0.0, 0.0)
+    with pytest.raises(OptionError, match="no background 'pink'"):
+        backdrop(capture, "pink")
     image = PictureStore(capture, (1.0, 1.0, 1.0)).image(0)
     assert image[0, 0].tolist() == [1.0, 1.0, 1.0]
     half = PictureStore(capture, (1.0, 1.0, 1.0))
@@ -278,6 +290,26 @@ def test_pictures_without_a_plain_background_are_put_on_white(tmp_path):
             path.unlink()
     with pytest.raises(OptionError, match="no masks"):
         backdrop(open_capture(tmp_path / "ball"), "auto")
+
+
+def test_a_plain_background_is_seen_where_nothing_states_it(tmp_path):
+    """VHAP and NeRSemble put pictures on white and do not say so."""
+    write_capture(tmp_path / "ball", background=False, focal=0.9)
+    capture = open_capture(tmp_path / "ball")
+    color, composed = backdrop(capture, "auto")
+    assert color == pytest.approx((1.0, 0.8, 0.6), abs=1e-9)
+    assert not composed
+    assert backdrop(capture, "white") == ((1.0, 1.0, 1.0), True)
+    assert backdrop(capture, (1.0, 0.8, 0.6)) == (color, False)
+
+
+def test_an_avatar_is_scored_on_the_background_that_it_was_fitted_on(tmp_path):
+    truth = write_capture(tmp_path / "ball", background=False, focal=0.9)
+    noisy_background(tmp_path / "ball")
+    truth.config = replace(truth.config, background=(0.0, 0.0, 0.0))
+    truth.save_pretrained(tmp_path / "avatar")
+    # Edges are put on black twice, which thins them; on white the score would be below 10.
+    assert score(tmp_path / "avatar", tmp_path / "ball", "novel_view") > 15
 
 
 def test_lpips_by_a_file_of_weights(tmp_path):
