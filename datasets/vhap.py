@@ -119,8 +119,8 @@ def read_capture(directory: Path) -> Capture:
         if mask is not None:
             masks[view.name] = mask
     if masks and len(masks) < len(views):
-        absent = next(view.name for view in views if view.name not in masks)
-        raise FileFormatError(f"{directory}: some frames have fg_mask_path, others, such as {absent}, none")
+        bare = next(view.name for view in views if view.name not in masks)
+        raise FileFormatError(f"{directory}: some frames have fg_mask_path, others, such as {bare}, none")
     parameters, offset = _read_parameters(directory, [key[1] for key in keys]) if files else (None, None)
     views.sort(key=lambda view: (view.timestep, view.camera))
     return Capture(
@@ -200,7 +200,7 @@ def _focal(frame: Mapping[str, Any], axis: str, size: int) -> float:
 
 def _read_parameters(directory: Path, files: Sequence[str]) -> tuple[HeadParameters, np.ndarray | None]:
     rows: dict[str, list[np.ndarray]] = {ours: [] for ours, _ in PARAMETERS.values()}
-    identities: dict[Path, tuple[np.ndarray, np.ndarray | None]] = {}  # of each sequence
+    identities: dict[Path, tuple[np.ndarray, np.ndarray]] = {}  # of each sequence
     for file in files:
         path = directory / file
         arrays = read_npz(path)
@@ -222,15 +222,13 @@ def _read_parameters(directory: Path, files: Sequence[str]) -> tuple[HeadParamet
     shape, offset = next(iter(identities.values()))
     tensors = {name: torch.from_numpy(np.stack(values)) for name, values in rows.items()}
     tensors["shape"] = torch.from_numpy(shape)[None]
-    if offset is not None and not offset.any():
-        offset = None  # it says nothing about the topology either: teeth may be missing from it
-    return HeadParameters(**tensors), offset
+    # Zeros say nothing about the topology either: teeth may be missing from them.
+    return HeadParameters(**tensors), offset if offset.any() else None
 
 
-def _static_offset(path: Path, arrays: Mapping[str, np.ndarray]) -> np.ndarray | None:
-    if "static_offset" not in arrays:
-        return None
-    found = np.asarray(arrays["static_offset"], np.float32)
+def _static_offset(path: Path, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
+    """(V, 3); no rows where there is none."""
+    found = np.asarray(arrays.get("static_offset", np.zeros((0, 3))), np.float32)
     if found.ndim == 3 and len(found) == 1:
         found = found[0]
     if found.ndim != 2 or found.shape[1] != 3 or not np.isfinite(found).all():
