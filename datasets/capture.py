@@ -17,6 +17,7 @@ from PIL import Image
 from torch import Tensor
 from tqdm import tqdm
 
+from meshanim.audio import load_waveform
 from meshanim.errors import FileFormatError, OptionError, ShapeError
 from meshanim.geometry import TriangleMesh
 from meshanim.heads import Head, HeadParameters, HeadSurface, load_head
@@ -146,6 +147,11 @@ class Capture:
         Colour around the head, sRGB in [0, 1], where it is plain.
     scale : float
         Pixels a side, as a share of the files'.
+    fps : float, optional
+        Timesteps a second, where they follow each other as in a video.
+    speech : mapping of int to Path
+        Sound files by the timestep that they begin with; timestep t of one that begins with s lasts from
+        (t - s) / fps to (t - s + 1) / fps seconds.
     """
 
     name: str
@@ -162,6 +168,8 @@ class Capture:
     region_names: tuple[str, ...] = ()
     background: tuple[float, float, float] | None = None
     scale: float = 1.0
+    fps: float | None = None
+    speech: Mapping[int, Path] = field(default_factory=dict, repr=False)
 
     def __len__(self) -> int:
         return len(self.views)
@@ -274,8 +282,13 @@ class Capture:
         return posed[0] if np.ndim(timesteps) == 0 else posed
 
     def check(self, progress: bool = False) -> list[str]:
-        """Read every picture; every defect as one line, empty if all is well."""
+        """Read every picture and sound; every defect as one line, empty if all is well."""
         defects = []
+        for path in self.speech.values():
+            try:
+                load_waveform(path, rate=None)
+            except FileFormatError as error:
+                defects.append(f"{path.name}: {error}")
         for index in tqdm(range(len(self)), "pictures", disable=not progress):
             try:
                 self[index]

@@ -8,7 +8,8 @@
     DIR/head.npz                  shape (1, S), expression (T, E), rotation, neck, jaw (T, 3), eyes (T, 6),
                                   translation (T, 3): what is not there is zero; timesteps (T,): the TTTTT of
                                   each row, 0 to T - 1 if not given. May be missing
-    DIR/capture.json              name, head, background, regions, splits; all of it optional
+    DIR/speech/TTTTT.wav          what is heard from timestep TTTTT on, of a video; may be missing
+    DIR/capture.json              name, head, background, regions, splits, fps (of videos); all of it optional
     DIR/offset.npz                static_offset (V, 3): metres, added to the head's template; may be missing
     DIR/surface.npz               the drawn triangles (`HeadSurface`), where they are not the head's own
 
@@ -27,6 +28,7 @@ import torch
 from PIL import Image
 from tqdm import tqdm
 
+from meshanim.audio import Waveform, load_waveform, save_waveform
 from meshanim.datasets.capture import Capture, Picture, View, check_camera, read_image, read_plane
 from meshanim.errors import FileFormatError
 from meshanim.files import read_json, read_npz, written_whole
@@ -35,14 +37,16 @@ from meshanim.heads import HeadParameters, HeadSurface
 __all__ = [
     "detect",
     "read_capture",
+    "remove_half_written",
     "write_cameras",
     "write_capture",
     "write_parameters",
     "write_picture",
     "write_record",
+    "write_speech",
 ]
 
-IMAGES, MASKS, REGION_MAPS = "images", "masks", "regions"
+IMAGES, MASKS, REGION_MAPS, SPEECH = "images", "masks", "regions", "speech"
 ENDINGS = (".png", ".jpg", ".jpeg")
 WIDTHS = {"rotation": 3, "neck": 3, "jaw": 3, "eyes": 6, "translation": 3}
 
@@ -116,7 +120,19 @@ def read_capture(directory: Path) -> Capture:
         surface=HeadSurface.load(surface) if surface.is_file() else None,
         region_names=tuple(record.get("regions", ())),
         background=tuple(record["background"]) if record.get("background") else None,
+        fps=record.get("fps"),
+        speech=_speech(directory / SPEECH, rows),
     )
+
+
+def _speech(folder: Path, rows: Mapping[int, int]) -> dict[int, Path]:
+    """Sound files by the row that they begin with."""
+    found = {}
+    for path in sorted(folder.glob("[!.]*")) if folder.is_dir() else ():
+        if not path.stem.isdigit() or int(path.stem) not in rows:
+            raise FileFormatError(f"{path} is named after no timestep: TTTTT.wav begins with timestep TTTTT")
+        found[rows[int(path.stem)]] = path
+    return found
 
 
 def _listed(folder: Path) -> dict[str, Path]:
@@ -187,6 +203,9 @@ def _read_record(path: Path) -> dict[str, Any]:
     background = record.get("background")
     if background and not (isinstance(background, list) and len(background) == 3):
         raise FileFormatError(f"{path}: background is {background}, expected three numbers in [0, 1]")
+    fps = record.get("fps")
+    if fps is not None and not (isinstance(fps, int | float) and fps > 0):
+        raise FileFormatError(f"{path}: fps is {fps}, expected frames a second")
     return record
 
 
@@ -278,12 +297,14 @@ def write_capture(capture: Capture, target: str | Path, progress: bool = False) 
     if capture.static_offset is not None:
         with written_whole(target / "offset.npz") as temporary:
             np.savez_compressed(temporary, static_offset=capture.static_offset)
+    write_speech(target, {row: load_waveform(path, rate=None) for row, path in capture.speech.items()})
     splits = {split: [names[index] for index in indices] for split, indices in capture.splits.items()}
     record = {
         "name": capture.name,
         "head": capture.head_name,
         "background": capture.background,
         "regions": list(capture.region_names),
+        "fps": capture.fps,
         "frames": list(capture.timesteps),
         "splits": splits,
     }
@@ -330,6 +351,20 @@ def write_picture(directory: Path, name: str, picture: Picture) -> None:
             continue
         (directory / folder).mkdir(parents=True, exist_ok=True)
         write_image(directory / folder / f"{name}.png", array)
+
+
+def write_speech(directory: Path, speech: Mapping[int, Waveform]) -> None:
+    """Write speech/TTTTT.wav: what is heard from a timestep on."""
+    for timestep, waveform in speech.items():
+        (directory / SPEECH).mkdir(parents=True, exist_ok=True)
+        save_waveform(waveform, directory / SPEECH / f"{timestep:05d}.wav")
+
+
+def remove_half_written(directory: Path) -> None:
+    """Remove what writers that were killed left behind."""
+    for folder in (directory, *(directory / name for name in (IMAGES, MASKS, REGION_MAPS, SPEECH))):
+        for left in folder.glob(".*.*"):
+            left.unlink()
 
 
 def write_image(path: Path, array: np.ndarray) -> None:

@@ -14,7 +14,14 @@ from scipy.ndimage import gaussian_filter
 from tqdm import tqdm
 
 from meshanim.datasets.capture import REGIONS, Picture
-from meshanim.datasets.capture_folder import write_cameras, write_parameters, write_picture, write_record
+from meshanim.datasets.capture_folder import (
+    remove_half_written,
+    write_cameras,
+    write_parameters,
+    write_picture,
+    write_record,
+    write_speech,
+)
 from meshanim.datasets.synthetic.camera_rig import (
     front_of_rig,
     orbit_camera,
@@ -80,7 +87,7 @@ class CaptureOptions:
     """Training frames of each person; a quarter as many more are held out."""
     moments: Literal["spread", "video"] = "spread"
     """spread: half hand-made faces, half moments of speech that differ most. video: speech, frame
-    after frame."""
+    after frame, with its sound in speech/."""
     head_motion: float = 0.0
     """Share of the speaker's head rotation that is kept, 0 to 1; the light stands still."""
     background: tuple[float, float, float] = (0.7, 0.7, 0.7)
@@ -181,11 +188,15 @@ def synthesize_capture(
             plans.append(made)
             bar.update()
     plans.sort(key=lambda made: made.folder)
+    for made in plans:
+        remove_half_written(made.folder)
     jobs = [job for made in plans for job in _jobs(made)]
     total, left = sum(len(made.pictures) for made in plans), sum(len(job.pictures) for job in jobs)
     with tqdm(total=total, initial=total - left, disable=not progress, desc="pictures") as bar:
         for count in run_jobs(_draw, jobs, corpus.workers, corpus.dask):
             bar.update(count)
+    for made in plans:  # by workers that were killed
+        remove_half_written(made.folder)
     return [made.folder for made in plans]
 
 
@@ -216,10 +227,8 @@ def _plan(corpus: SynthesizeOptions, options: CaptureOptions, job: tuple[int, Pe
     """Decide frames and cameras of one person, and write everything but the pictures."""
     index, person = job
     head, appearance = _look()[0], _appearance(_Whom(person))
-    training, held_out = choose_moments(
-        corpus, index, options.frames, options.held_out_frames, options.moments
-    )
-    moments = [*training, *held_out]
+    chosen = choose_moments(corpus, index, options.frames, options.held_out_frames, options.moments)
+    training, moments = chosen.training, [*chosen.training, *chosen.held_out]
     columns = np.stack([moment.weights(head.expression_names) for moment in moments])
     rest = head.expression(person.rest_expression).numpy()
     turns = np.stack([moment.turn for moment in moments]) * np.float32(options.head_motion)
@@ -231,7 +240,7 @@ def _plan(corpus: SynthesizeOptions, options: CaptureOptions, job: tuple[int, Pe
     target, distance = _standpoint(appearance)
     take = partial(orbit_camera, target, distance, size=options.size)
     lay_out = _rig if options.cameras == "rig" else partial(_random_cameras, [corpus.seed, index])
-    cameras, splits = lay_out(options, len(training), len(held_out), take)
+    cameras, splits = lay_out(options, len(training), len(chosen.held_out), take)
     folder = corpus.directory / person.name.lower()
     folder.mkdir(exist_ok=True)
     write_cameras(
@@ -240,15 +249,19 @@ def _plan(corpus: SynthesizeOptions, options: CaptureOptions, job: tuple[int, Pe
     )
     write_parameters(folder, parameters, range(len(moments)))
     drawn_surface(head, appearance).save(folder / "surface.npz")
+    if chosen.speech:
+        starts = (0, len(training))
+        write_speech(folder, dict(zip(starts, chosen.speech)))
     record: dict[str, Any] = {
         "name": person.name,
         "head": "default",
         "background": _stored(options.background),
         "regions": list(REGIONS),
+        "fps": float(corpus.fps) if chosen.speech else None,
         "frames": [moment.name for moment in moments],
         "splits": splits,
     }
-    write_record(folder, record)
+    write_record(folder, {key: value for key, value in record.items() if value is not None})
     names = sorted({name for split in splits.values() for name in split})
     pictures = tuple((name, int(name[:5]), name if name in cameras else name[6:]) for name in names)
     return _Plan(folder, person, parameters, columns, cameras, pictures, options)

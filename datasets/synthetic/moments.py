@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Float32
 
-from meshanim.audio import voices
+from meshanim.audio import Waveform, voices
 from meshanim.datasets.synthetic.corpus import SynthesizeOptions, act, cast, takes
 from meshanim.datasets.synthetic.expressions import HELD_OUT, TRAINING
-from meshanim.datasets.synthetic.performance import CURVE_NAMES, Performance
+from meshanim.datasets.synthetic.performance import CURVE_NAMES
 from meshanim.errors import DependencyError, OptionError
 
-__all__ = ["Moment", "choose_moments", "farthest"]
+__all__ = ["Chosen", "Moment", "choose_moments", "farthest"]
 
 TRAINING_SENTENCES, HELD_OUT_SENTENCES = 4, 2
 """Sentences from which the moments that differ most are taken."""
@@ -46,9 +46,24 @@ class Moment:
         return np.array(known, np.float32)
 
 
-def choose_moments(
-    corpus: SynthesizeOptions, person: int, training: int, held_out: int, kind: str
-) -> tuple[list[Moment], list[Moment]]:
+@dataclass(frozen=True)
+class Chosen:
+    """Moments of one person.
+
+    Parameters
+    ----------
+    training, held_out : tuple of Moment
+        To train on, and others of other faces and sentences.
+    speech : tuple of two Waveform
+        What is heard from the first frame of each on, of a video; empty of moments that are spread.
+    """
+
+    training: tuple[Moment, ...]
+    held_out: tuple[Moment, ...]
+    speech: tuple[Waveform, ...] = ()
+
+
+def choose_moments(corpus: SynthesizeOptions, person: int, training: int, held_out: int, kind: str) -> Chosen:
     """Moments to train on, and others of other faces and sentences.
 
     Parameters
@@ -79,12 +94,14 @@ def choose_moments(
     if len(spoken) < 2:
         raise OptionError(f"--sentences is {len(spoken)}; images need two: one to train on, one held out")
     if kind == "video":
-        return _in_order(spoken, corpus.fps, training), _in_order(spoken[::-1], corpus.fps, held_out)
+        shown, heard = _in_order(spoken, corpus.fps, training)
+        others, heard_there = _in_order(spoken[::-1], corpus.fps, held_out)
+        return Chosen(shown, others, (heard, heard_there))
     kept = min(HELD_OUT_SENTENCES, len(spoken) - 1)
     first, last = spoken[: min(TRAINING_SENTENCES, len(spoken) - kept)], spoken[len(spoken) - kept :]
-    return (
-        _spread(first, corpus.fps, TRAINING, training, HAND_MADE_SHARE[0]),
-        _spread(last, corpus.fps, HELD_OUT, held_out, HAND_MADE_SHARE[1]),
+    return Chosen(
+        tuple(_spread(first, corpus.fps, TRAINING, training, HAND_MADE_SHARE[0])),
+        tuple(_spread(last, corpus.fps, HELD_OUT, held_out, HAND_MADE_SHARE[1])),
     )
 
 
@@ -98,29 +115,38 @@ def _spread(spoken, fps: float, faces: dict[str, dict[str, float]], count: int, 
         moments.append(Moment(name, curves, np.zeros(3, np.float32)))
     if count == made:
         return moments
-    everything = [moment for take in spoken for moment in _performed(take, fps)]
+    everything = [moment for take in spoken for moment in _performed(take, fps)[0]]
     if len(everything) < count - made:
         raise OptionError(f"{len(everything)} frames are spoken, {count - made} are wanted: lower --frames")
     chosen = farthest(np.stack([moment.curves for moment in everything]), count - made)
     return moments + [everything[index] for index in sorted(chosen)]
 
 
-def _in_order(spoken, fps: float, count: int) -> list[Moment]:
+def _in_order(spoken, fps: float, count: int) -> tuple[tuple[Moment, ...], Waveform]:
+    """Sentence after sentence, and the sound of that: frame i lasts from i / fps to (i + 1) / fps seconds."""
     moments: list[Moment] = []
+    heard: list[np.ndarray] = []
     for take in spoken[:-1]:  # the last one belongs to the other split
-        moments += _performed(take, fps)
+        performed, waveform = _performed(take, fps)
+        moments += performed
+        heard.append(waveform.samples)
+        # A sentence ends within its last frame: the next one begins with a frame of its own.
+        until = round(len(moments) * waveform.rate / fps)
+        heard.append(np.zeros(max(0, until - sum(map(len, heard))), np.float32))
         if len(moments) >= count:
-            return moments[:count]
+            samples = np.concatenate(heard)[: round(count * waveform.rate / fps)]
+            return tuple(moments[:count]), Waveform(samples, waveform.rate)
     raise OptionError(f"{len(moments)} frames are spoken, {count} are wanted: raise --sentences or --fps")
 
 
-def _performed(take, fps: float) -> list[Moment]:
-    performance: Performance = act(take, fps)[2]
+def _performed(take, fps: float) -> tuple[list[Moment], Waveform]:
+    waveform, _, performance = act(take, fps)
     name = f"{take.member.name}_sentence{take.sentence:02d}"
-    return [
+    moments = [
         Moment(f"{name} frame {index}", curves, turn)
         for index, (curves, turn) in enumerate(zip(performance.curves, performance.pose))
     ]
+    return moments, waveform
 
 
 def farthest(points: Float[np.ndarray, "points dims"], count: int) -> list[int]:

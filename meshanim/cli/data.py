@@ -274,6 +274,8 @@ def _capture_description(capture: Capture) -> dict[str, Any]:
         "head": capture.head_name,
         "tracked": capture.parameters is not None,
         "regions": list(capture.region_names),
+        "fps": capture.fps,
+        "speech": len(capture.speech),
         "triangles": len(capture.surface.faces) if capture.surface else 0,
         "splits": {split: len(indices) for split, indices in capture.splits.items()},
     }
@@ -287,6 +289,8 @@ def _print_capture(about: Mapping[str, Any]) -> None:
     print(f"{about['pictures']} pictures of {sizes} ({splits})")
     print(f"{about['camera_positions']} camera positions, {about['timesteps']} timesteps, {head}")
     print(f"regions: {', '.join(about['regions']) or 'none'}")
+    if about["fps"]:
+        print(f"video: {about['fps']:g} timesteps a second, {about['speech']} sound files")
 
 
 def _of_capture(options: InfoOptions | CheckOptions) -> bool:

@@ -2,22 +2,27 @@
 
 import hashlib
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from meshanim.audio import Waveform, load_waveform
 from meshanim.cli import main
 from meshanim.datasets import open_capture
 from meshanim.datasets.capture import REGIONS
+from meshanim.datasets.capture_folder import write_capture
 from meshanim.datasets.synthetic import capture as synthetic
+from meshanim.datasets.synthetic import moments
 from meshanim.datasets.synthetic.camera_rig import front_of_rig, rig_directions
 from meshanim.datasets.synthetic.capture import CaptureOptions, cast_people, synthesize_capture
 from meshanim.datasets.synthetic.corpus import SynthesizeOptions
 from meshanim.datasets.synthetic.expressions import HELD_OUT, TRAINING
-from meshanim.datasets.synthetic.moments import farthest
+from meshanim.datasets.synthetic.moments import choose_moments, farthest
 from meshanim.datasets.synthetic.performance import CURVE_NAMES
-from meshanim.errors import OptionError
+from meshanim.errors import FileFormatError, OptionError
 from meshanim.render import Camera, rasterize
+from meshanim.render.look import find_person
 from meshanim.render.rasterizer import native_available
 
 pytest.importorskip("pocketsphinx")
@@ -124,6 +129,97 @@ def test_same_seed_same_files_and_a_broken_run_goes_on(folder, tmp_path):
     assert kept.stat().st_mtime_ns == before
     with pytest.raises(OptionError, match="size 96"):
         synthesize_capture(corpus, replace(chosen, size=64), progress=False)
+
+
+def test_two_processes_draw_the_same_bytes_as_one(folder, tmp_path):
+    corpus, chosen = options(tmp_path / "two", head_motion=1.0)
+    made = synthesize_capture(replace(corpus, workers=2), chosen, progress=False)
+    assert fingerprint(made[0].parent) == fingerprint(folder.parent)
+
+
+def test_what_a_killed_run_left_half_written_is_made_whole(folder, tmp_path, monkeypatch):
+    corpus, chosen = options(tmp_path / "killed", head_motion=1.0)
+    write, count = synthetic.write_picture, 0
+
+    def dying(directory, name, picture):
+        nonlocal count
+        count += 1
+        if count == 4:  # the region map is there, the mask is being written
+            write(directory, name, replace(picture, mask=None))
+            (directory / "images" / f"{name}.png").unlink()
+            (directory / "masks" / f".{name}-x7.png").write_bytes(b"half")
+            raise KeyboardInterrupt
+        write(directory, name, picture)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(synthetic, "write_picture", dying)
+        with pytest.raises(KeyboardInterrupt):
+            synthesize_capture(corpus, chosen, progress=False)
+    left = fingerprint(tmp_path / "killed")
+    assert left != fingerprint(folder.parent)
+    assert len(list((tmp_path / "killed").rglob("images/*.png"))) == 3
+    synthesize_capture(corpus, chosen, progress=False)
+    assert fingerprint(tmp_path / "killed") == fingerprint(folder.parent)
+
+
+def test_a_video_has_its_sound_beside_it(tmp_path):
+    corpus, chosen = options(tmp_path / "video", size=32, views=1, frames=3, moments="video")
+    corpus = replace(corpus, fps=25)
+    path = synthesize_capture(corpus, chosen, progress=False)[0]
+    capture = open_capture(path)
+    assert capture.fps == 25.0
+    assert {row: file.name for row, file in capture.speech.items()} == {0: "00000.wav", 3: "00003.wav"}
+    heard = load_waveform(capture.speech[0], rate=None)
+    assert len(heard.samples) == round(3 * heard.rate / 25)
+    assert len(load_waveform(capture.speech[3], rate=None).samples) == round(heard.rate / 25)
+    spoken = choose_moments(corpus, 0, 3, 1, "video")
+    np.testing.assert_allclose(heard.samples, spoken.speech[0].samples, atol=1 / 32767)
+    expected = np.stack([moment.curves for moment in spoken.training])
+    drive = capture.parameters.expression[:3] - capture.head.expression(find_person("bruno").rest_expression)
+    columns = [CURVE_NAMES.index(name) for name in capture.head.expression_names if name in CURVE_NAMES]
+    rows = [row for row, name in enumerate(capture.head.expression_names) if name in CURVE_NAMES]
+    np.testing.assert_allclose(drive[:, rows].numpy(), expected[:, columns], atol=1e-6)
+    assert capture.check() == []
+    copy = open_capture(write_capture(capture, tmp_path / "copy"))
+    assert (copy.fps, sorted(copy.speech)) == (25.0, [0, 3])
+    assert copy.speech[0].read_bytes() == capture.speech[0].read_bytes()
+    capture.speech[0].write_bytes(b"none")
+    assert "00000.wav" in capture.check()[0]
+    capture.speech[0].rename(path / "speech" / "sentence.wav")
+    with pytest.raises(FileFormatError, match=r"sentence\.wav is named after no timestep"):
+        open_capture(path)
+
+
+def test_sentences_follow_each_other_frame_by_frame(monkeypatch):
+    """Each begins with a frame of its own: sound and faces stay together over any number of sentences."""
+    rate, fps = 1000, 30.0
+
+    def acted(take, _):
+        samples = np.full(110 * take, take, np.float32)  # a tenth of its last frame is spoken, or two, ...
+        frames = int(np.ceil(110 * take * fps / rate))
+        curves, pose = np.full((frames, 53), take, np.float32), np.zeros((frames, 3), np.float32)
+        performance = SimpleNamespace(curves=curves, pose=pose)
+        return Waveform(samples / 10, rate), [], performance
+
+    monkeypatch.setattr(moments, "act", acted)
+    takes = [Said(number) for number in (1, 2, 3, 4)]
+    found, heard = moments._in_order(takes, fps, 16)
+    said = [int(moment.curves[0]) for moment in found]
+    assert said == [1] * 4 + [2] * 7 + [3] * 5
+    for index, number in enumerate(said):
+        frame = heard.samples[round(index * rate / fps) : round((index + 1) * rate / fps)]
+        assert set(np.round(10 * frame)) <= {0, number}, index
+        assert round(10 * frame[0]) == number
+    assert len(heard.samples) == round(16 * rate / fps)
+    with pytest.raises(OptionError, match="21 frames are spoken, 30 are wanted"):
+        moments._in_order(takes, fps, 30)
+
+
+class Said(int):
+    """A sentence that is its number."""
+
+    sentence = 1
+    member = SimpleNamespace(name="S01")
 
 
 def test_a_rig_from_the_command_line(tmp_path, capsys):
