@@ -103,7 +103,16 @@ class TransformerEncoder(SpeechEncoder):
         if len(samples) < self.receptive:
             samples = torch.nn.functional.pad(samples, (0, self.receptive - len(samples)))
         states = self._hidden_states(samples)
+        return self._at_frames(states, count)
 
+    def frames_of_states(self, samples: int) -> Float32[Tensor, "frames states"]:
+        """The matrix that makes the frames of so many samples, heard at once, of their hidden states."""
+        states = (max(samples, self.receptive) - self.receptive) // self.stride + 1
+        count = max(1, math.ceil(samples * self.rate / self.sample_rate - 1e-9))
+        return self._at_frames(torch.eye(states), count)
+
+    def _at_frames(self, states: Float32[Tensor, "states dim"], count: int) -> Float32[Tensor, "frames dim"]:
+        """States at the frames' middles, linearly interpolated."""
         times = (torch.arange(count, dtype=torch.float64) + 0.5) / self.rate * self.sample_rate
         position = ((times - self.receptive / 2) / self.stride).clamp(0, len(states) - 1)
         lower = position.floor().long()

@@ -22,6 +22,7 @@ VERBS = {
     "avatar": "Gaussian avatars: fit to pictures, evaluate on held-out ones, render",
     "data": "data sets: synthesize, info, check, convert, augment-pose, personalize, ...",
     "solve": "the motion of a mesh in, blendshape weights out",
+    "export": "networks for other programs: onnx",
     "bench": "measurements that anyone can repeat: attention, animate, binding, image-loss, solve",
     "doctor": "what is installed, which backends work, how to get what is missing",
 }

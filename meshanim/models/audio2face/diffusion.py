@@ -147,7 +147,7 @@ class IdentityExperts(nn.Module):
         self, steps: Float[Tensor, "batch steps width"], identities: Float[Tensor, "batch experts"]
     ) -> Float[Tensor, "batch steps width"]:
         matrices = torch.einsum("bi,ihw->bhw", identities, self.matrices)
-        hidden = steps @ matrices.mT + (identities @ self.offsets)[:, None]
+        hidden = steps @ matrices.transpose(1, 2) + (identities @ self.offsets)[:, None]
         return steps + self.second(functional.gelu(hidden))
 
 

@@ -134,7 +134,8 @@ def window_autocorrelation(windows: Float[Tensor, "batch samples"]) -> Float[Ten
     The same as `meshanim.audio.autocorrelation`, by products instead of a transform, so that it can be
     exported. Source: Karras et al., SIGGRAPH 2017, Sec. 3.2.
     """
-    parts = windows.unfold(-1, SHORT, HOP)
+    first = HOP * torch.arange(STEPS, device=windows.device)[:, None]
+    parts = windows[:, first + torch.arange(SHORT, device=windows.device)]
     hann = torch.hann_window(SHORT, periodic=False, dtype=windows.dtype, device=windows.device)
     parts = (parts - parts.mean(-1, keepdim=True)) * hann
     sums = [(parts[..., : SHORT - lag] * parts[..., lag:]).sum(-1) for lag in range(LAGS)]
@@ -168,7 +169,7 @@ class HybridEncoder(nn.Module):
         for layer in self.frequency:
             heard = functional.relu(layer(heard))
         spoken = functional.relu(self.features((features - self.feature_mean) / self.feature_scale))
-        return torch.cat([heard[..., 0], spoken.mT], dim=1)
+        return torch.cat([heard[..., 0], spoken.transpose(1, 2)], dim=1)
 
 
 class Audio2FaceRegression(Checkpoint):
