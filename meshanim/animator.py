@@ -19,6 +19,7 @@ from meshanim.errors import FileFormatError, OptionError, ShapeError
 from meshanim.geometry import TriangleMesh
 from meshanim.geometry.correspondence import surface_correspondence
 from meshanim.heads import Head, load_head
+from meshanim.models.audio2face import EmotionTrack
 from meshanim.models.gava import Gava
 from meshanim.models.loading import load_network
 from meshanim.motion import MeshSequence
@@ -95,6 +96,16 @@ class AnimationStream:
         """
         self._samples += len(samples)
         return self._advance(np.asarray(samples, np.float32), last=False)
+
+    def feel(self, emotions: EmotionTrack) -> None:
+        """Follow other emotions from the next frame on, Audio2Face's networks only.
+
+        Raises
+        ------
+        OptionError
+            If the network has one style for a speech, or the track does not fit it.
+        """
+        self._performance.feel(emotions)
 
     def finish(self) -> Frames:
         """End the speech and give the last frames.

@@ -156,6 +156,16 @@ class Performance(ABC):
             If the stream is finished.
         """
 
+    def feel(self, emotions: EmotionTrack) -> None:
+        """Follow other emotions from the next frame on.
+
+        Raises
+        ------
+        OptionError
+            If the network has one style for a speech, or the track does not fit it.
+        """
+        raise OptionError("GAVA has one emotion for a speech; Audio2Face's networks follow them over time")
+
 
 class GavaPerformance(Performance):
     """GAVA: features, and mel frames where it turns the head.
@@ -240,6 +250,9 @@ class RegressionPerformance(Performance):
         self.basis, self.fps = model.actors.basis.to(model.device), self.stream.fps
         self.template = _template(model, template, 0)
 
+    def feel(self, emotions: EmotionTrack) -> None:
+        self.stream.emotions = checked_track(emotions, self.stream.emotions)
+
     def push(self, samples: Float32[np.ndarray, " samples"], frames: int | None = None) -> Motion:
         states = _advance(self.stream, samples, frames)
         return Motion(self.basis.decode(states), states.new_zeros(len(states), 3))
@@ -288,6 +301,9 @@ class DiffusionPerformance(Performance):
             rows = [head.expression_names.index(name) for name in config.rig]
             self.shapes = head.expression_directions[rows].to(model.device)
 
+    def feel(self, emotions: EmotionTrack) -> None:
+        self.stream.emotions = checked_track(emotions, self.stream.emotions)
+
     def push(self, samples: Float32[np.ndarray, " samples"], frames: int | None = None) -> Motion:
         found = _advance(self.stream, samples, frames)
         pose = head_rotation(self.model.head_motion(found)) if len(found) else found.new_zeros(0, 3)
@@ -332,6 +348,14 @@ def perform(
     if isinstance(network, Audio2FaceDiffusion):
         return DiffusionPerformance(network, encoder, options, template, head)
     return GavaPerformance(network, encoder, options, template, seal)
+
+
+def checked_track(track: EmotionTrack, other: EmotionTrack) -> EmotionTrack:
+    """The track, if it has as many emotions as the other; OptionError otherwise."""
+    given, wanted = track.strengths.shape[1], other.strengths.shape[1]
+    if given != wanted:
+        raise OptionError(f"the track has {given} emotions, the network {wanted}")
+    return track
 
 
 def emotion_track(

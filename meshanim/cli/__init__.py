@@ -17,12 +17,13 @@ __all__ = ["main"]
 VERBS = {
     "animate": "speech in; a video, glTF, npz or contact sheet of a talking head out",
     "demo": "the same on a recorded sentence that ships with the package",
-    "train": "train a model: gava",
-    "evaluate": "score models and motion on held-out data, compare scores: gava, motion, compare, ...",
+    "train": "train a network: gava, a2f-regression, a2f-diffusion, syncnet",
+    "evaluate": "score models and motion on held-out data, compare scores: gava, a2f, motion, ...",
     "avatar": "Gaussian avatars: fit to pictures, evaluate on held-out ones, render",
     "data": "data sets: synthesize, info, check, convert, augment-pose, personalize, ...",
     "solve": "the motion of a mesh in, blendshape weights out",
     "export": "networks for other programs: onnx",
+    "serve": "speech in, blendshape weights out over a network: grpc",
     "bench": "measurements that anyone can repeat: attention, animate, binding, image-loss, solve",
     "doctor": "what is installed, which backends work, how to get what is missing",
 }

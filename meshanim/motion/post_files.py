@@ -133,11 +133,11 @@ def _settings(values: Any) -> PostSettings:
         config = dict(_mapping(values["config"], "config"))
         shot, frame = config.pop("source_shot", None), config.pop("source_frame", None)
         source = None if shot is None or frame is None else (str(shot), int(frame))
-        return PostSettings(PostTrack.of(_controls(config, PostProcessing())), source=source)
+        return PostSettings(PostTrack.of(controls_of(config, PostProcessing())), source=source)
     unknown = set(values) - set(SECTIONS)
     if unknown:
         raise ValueError(f"no section {', '.join(sorted(map(str, unknown)))}; known: {', '.join(SECTIONS)}")
-    base = _controls(_mapping(values.get("face_parameters"), "face_parameters"), PostProcessing())
+    base = controls_of(_mapping(values.get("face_parameters"), "face_parameters"), PostProcessing())
     shapes = _mapping(values.get("blendshape_parameters"), "blendshape_parameters")
     heard = dict(_mapping(values.get("post_processing_parameters"), "post_processing_parameters"))
     if "live_transition_time" in values:
@@ -169,7 +169,16 @@ def _number(value: Any, name: str) -> float:
     return float(value)
 
 
-def _controls(values: Mapping[str, Any], base: PostProcessing) -> PostProcessing:
+def controls_of(values: Mapping[str, Any], base: PostProcessing) -> PostProcessing:
+    """Controls by name, the rest as in `base`; names as here, in the SDK, or in the service (skinStrength).
+
+    Raises
+    ------
+    ValueError
+        If there is no such control, or a value is no number.
+    OptionError
+        If a number is outside its range.
+    """
     known = {control.name for control in PostProcessing.controls()}
     found = {}
     for name, value in values.items():
@@ -194,7 +203,7 @@ def _keyframes(values: Any, base: PostProcessing) -> PostTrack:
         timed.append((_number(entry.pop("time"), "time"), entry))
     times, keys = [], []
     for time, entry in sorted(timed, key=lambda one: one[0]):
-        base = _controls(entry, base)
+        base = controls_of(entry, base)
         times.append(time)
         keys.append(base)
     return PostTrack(times, keys)

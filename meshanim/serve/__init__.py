@@ -1,0 +1,1 @@
+"""Servers: speech in and animation out over a network."""
