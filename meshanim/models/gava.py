@@ -1,23 +1,20 @@
 """GAVA: speech to a talking, turning head by attention over the mesh (Li et al., TVCG 2025)."""
 
 import copy
-import json
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import torch
-from huggingface_hub import ModelCard, PyTorchModelHubMixin, hf_hub_download
+from huggingface_hub import ModelCard
 from jaxtyping import Float, Int
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from meshanim.attention import AttentionMaps, MeshGraph
-from meshanim.errors import FileFormatError, MeshError, OptionError, ShapeError
-from meshanim.files import written_whole
+from meshanim.errors import MeshError, OptionError, ShapeError
 from meshanim.geometry import TriangleMesh
+from meshanim.models.checkpoint import CONFIG, Checkpoint
 from meshanim.models.gava_parts import (
     GlobalDecoder,
     PoseEncoder,
@@ -28,8 +25,6 @@ from meshanim.models.gava_parts import (
 from meshanim.models.vertex_tokens import VertexTokens
 
 __all__ = ["Gava", "GavaConfig", "GavaOutput", "Topology"]
-
-WEIGHTS, CONFIG = "model.safetensors", "config.json"
 
 
 @dataclass(frozen=True)
@@ -167,7 +162,7 @@ class GavaOutput(NamedTuple):
     pose: Float[Tensor, "batch 3"]
 
 
-class Gava(nn.Module, PyTorchModelHubMixin):
+class Gava(Checkpoint):
     """Speech windows and a template mesh to vertex displacements and a head pose.
 
     Every vertex has an embedding made from its geometry. Codes read from the speech window modulate it into
@@ -192,6 +187,7 @@ class Gava(nn.Module, PyTorchModelHubMixin):
     with features "G".
     """
 
+    title = "GAVA"
     config: GavaConfig
     surface: VertexTokens
     feature_mean: Tensor
@@ -468,59 +464,20 @@ class Gava(nn.Module, PyTorchModelHubMixin):
 
     # -- files --------------------------------------------------------------------------------------------
 
-    def _save_pretrained(self, save_directory: Path) -> None:
-        state = {name: tensor.detach().cpu().contiguous() for name, tensor in self.state_dict().items()}
-        with written_whole(save_directory / WEIGHTS) as temporary:
-            save_file(state, temporary)
-        with written_whole(save_directory / CONFIG) as temporary:
-            temporary.write_text(json.dumps(asdict(self.config), indent=2) + "\n")
-
     def generate_model_card(self, *args, **kwargs) -> ModelCard:
         """README.md of a saved folder, where whoever saves it has not written another."""
         return ModelCard(model_card(self))
 
     @classmethod
-    def _from_pretrained(  # type: ignore[override]
-        cls,
-        *,
-        model_id: str,
-        revision: str | None,
-        cache_dir: str | Path | None,
-        force_download: bool,
-        local_files_only: bool,
-        token: str | bool | None,
-        config: GavaConfig | None = None,
-        map_location: str = "cpu",
-    ) -> "Gava":
-        if config is None:
-            raise FileFormatError(f"{model_id} has no {CONFIG}; expected a folder that save_pretrained wrote")
-        folder = Path(model_id)
-        if folder.is_dir():
-            weights = folder / WEIGHTS
-        else:
-            weights = Path(
-                hf_hub_download(
-                    repo_id=model_id,
-                    filename=WEIGHTS,
-                    revision=revision,
-                    cache_dir=cache_dir,
-                    force_download=force_download,
-                    token=token,
-                    local_files_only=local_files_only,
-                )
-            )
-        try:
-            state = load_file(weights, device=map_location)
-            prefixes = ["surface.", *(f"others.{k}." for k in range(len(config.each) - 1))]
-            surfaces = [
-                VertexTokens.from_state({n.removeprefix(p): t for n, t in state.items() if n.startswith(p)})
-                for p in prefixes
-            ]
-            model = cls(config, surfaces[0], surfaces[1:])
-            model.load_state_dict(state)
-        except (OSError, SafetensorError, RuntimeError) as error:
-            raise FileFormatError(f"{weights} is not a GAVA checkpoint: {error}") from error
-        return model.to(map_location).eval()
+    def restored(cls, config: GavaConfig, state: Mapping[str, Tensor], file: Callable[[str], Path]) -> "Gava":
+        prefixes = ["surface.", *(f"others.{k}." for k in range(len(config.each) - 1))]
+        surfaces = [
+            VertexTokens.from_state({n.removeprefix(p): t for n, t in state.items() if n.startswith(p)})
+            for p in prefixes
+        ]
+        model = cls(config, surfaces[0], surfaces[1:])
+        model.load_state_dict(state)
+        return model
 
 
 def model_card(model: Gava, sections: Mapping[str, str] | None = None) -> str:

@@ -8,11 +8,10 @@ from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntry
 from meshanim.errors import FileFormatError
 from meshanim.files import read_json
 from meshanim.models.audio2face import Audio2FaceDiffusion, Audio2FaceRegression
+from meshanim.models.checkpoint import CONFIG
 from meshanim.models.gava import Gava
 
 __all__ = ["load_network"]
-
-CONFIG = "config.json"
 
 
 def load_network(name: str | Path, device: str = "cpu") -> Gava | Audio2FaceRegression | Audio2FaceDiffusion:

@@ -5,23 +5,19 @@ those of different moments are not (Chung and Zisserman 2016, "Out of time"; on 
 Audio2Face-3D's benchmark scores lip sync with one (Sec. 7).
 """
 
-import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from huggingface_hub import ModelCard, PyTorchModelHubMixin, hf_hub_download
+from huggingface_hub import ModelCard
 from jaxtyping import Float, Float64
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from torch.nn import functional
 
-from meshanim.errors import FileFormatError, OptionError, ShapeError
-from meshanim.files import written_whole
+from meshanim.errors import OptionError, ShapeError
 from meshanim.models.audio2face.speech import features_at
+from meshanim.models.checkpoint import Checkpoint
 from meshanim.motion.face_parts import FaceParts
 
 __all__ = [
@@ -39,7 +35,6 @@ RATE = 25.0
 """Lip frames a second that the network sees, whatever the animation's rate."""
 MOMENT = 5
 """Lip frames of a moment: 0.2 s, as published."""
-WEIGHTS, CONFIG = "model.safetensors", "config.json"
 
 
 @dataclass(frozen=True)
@@ -155,7 +150,7 @@ def _encoder(channels: int, width: int, length: int) -> nn.Sequential:
     )
 
 
-class SyncNet(nn.Module, PyTorchModelHubMixin):
+class SyncNet(Checkpoint):
     """Unit vectors of lip motion and of speech.
 
     Parameters
@@ -164,6 +159,7 @@ class SyncNet(nn.Module, PyTorchModelHubMixin):
         Sizes, encoder and landmarks.
     """
 
+    title = "SyncNet"
     feature_mean: Tensor
     feature_scale: Tensor
     mouth_mean: Tensor
@@ -179,10 +175,6 @@ class SyncNet(nn.Module, PyTorchModelHubMixin):
         for name, size in (("feature", config.feature_dim), ("mouth", numbers)):
             self.register_buffer(f"{name}_mean", torch.zeros(size))
             self.register_buffer(f"{name}_scale", torch.ones(size))
-
-    @property
-    def device(self) -> torch.device:
-        return self.log_sharpness.device
 
     def see(self, moments: Float[Tensor, "batch 5 numbers"]) -> Float[Tensor, "batch width"]:
         """Unit vectors of lip motion, as `mouth_moments` gives it."""
@@ -266,15 +258,6 @@ class SyncNet(nn.Module, PyTorchModelHubMixin):
         least = int(curve.argmin())
         return SyncScore(float(curve[reach]), float(curve.median() - curve[least]), (least - reach) / RATE)
 
-    # -- files --------------------------------------------------------------------------------------------
-
-    def _save_pretrained(self, save_directory: Path) -> None:
-        state = {name: tensor.detach().cpu().contiguous() for name, tensor in self.state_dict().items()}
-        with written_whole(save_directory / WEIGHTS) as temporary:
-            save_file(state, temporary)
-        with written_whole(save_directory / CONFIG) as temporary:
-            temporary.write_text(json.dumps(asdict(self.config), indent=2) + "\n")
-
     def generate_model_card(self, *args, **kwargs) -> ModelCard:
         """README.md of a saved folder."""
         return ModelCard(
@@ -283,41 +266,6 @@ class SyncNet(nn.Module, PyTorchModelHubMixin):
             f"Speech encoder `{self.config.encoder}`, {len(self.config.landmarks)} landmarks. Read by\n"
             "`meshanim evaluate a2f --syncnet FOLDER`.\n"
         )
-
-    @classmethod
-    def _from_pretrained(  # type: ignore[override]
-        cls,
-        *,
-        model_id: str,
-        revision: str | None,
-        cache_dir: str | Path | None,
-        force_download: bool,
-        local_files_only: bool,
-        token: str | bool | None,
-        config: SyncConfig | None = None,
-        map_location: str = "cpu",
-    ) -> "SyncNet":
-        if config is None:
-            raise FileFormatError(f"{model_id} has no {CONFIG}; expected a folder that train syncnet wrote")
-        weights = Path(model_id) / WEIGHTS
-        if not Path(model_id).is_dir():
-            weights = Path(
-                hf_hub_download(
-                    repo_id=model_id,
-                    filename=WEIGHTS,
-                    revision=revision,
-                    cache_dir=cache_dir,
-                    force_download=force_download,
-                    token=token,
-                    local_files_only=local_files_only,
-                )
-            )
-        try:
-            model = cls(config)
-            model.load_state_dict(load_file(weights, device=map_location))
-        except (OSError, SafetensorError, RuntimeError) as error:
-            raise FileFormatError(f"{weights} is no SyncNet: {error}") from error
-        return model.to(map_location).eval()
 
 
 def speech_moments(

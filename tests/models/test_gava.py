@@ -190,7 +190,7 @@ def test_damaged_checkpoints_are_named(model, tmp_path):
     model.save_pretrained(tmp_path)
     weights = tmp_path / "model.safetensors"
     weights.write_bytes(weights.read_bytes()[:1000])
-    with pytest.raises(FileFormatError, match="not a GAVA checkpoint"):
+    with pytest.raises(FileFormatError, match="no checkpoint of GAVA"):
         Gava.from_pretrained(tmp_path)
     (tmp_path / "config.json").unlink()
     with pytest.raises(FileFormatError, match=r"config\.json"):

@@ -108,7 +108,7 @@ def test_it_is_saved_and_loaded(tmp_path):
     assert torch.equal(loaded(moments, features), network(moments, features))
     weights = tmp_path / "model.safetensors"
     weights.write_bytes(weights.read_bytes()[:-100])
-    with pytest.raises(FileFormatError, match="no SyncNet"):
+    with pytest.raises(FileFormatError, match="no checkpoint of SyncNet"):
         SyncNet.from_pretrained(tmp_path)
 
 

@@ -1,44 +1,28 @@
-"""Folders of Audio2Face checkpoints: config.json, model.safetensors, actors.safetensors."""
+"""Folders of Audio2Face checkpoints: those of any network, and actors.safetensors."""
 
-import json
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
-import torch
-from huggingface_hub import ModelCard, PyTorchModelHubMixin, hf_hub_download
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
-from torch import Tensor, nn
+from huggingface_hub import ModelCard
+from torch import Tensor
 
-from meshanim.errors import FileFormatError, MeshanimError, OptionError
-from meshanim.files import written_whole
+from meshanim.errors import OptionError
 from meshanim.geometry import TriangleMesh
+from meshanim.models.checkpoint import Checkpoint
 from meshanim.motion.animation_state import Actors, read_actors, write_actors
 
-__all__ = ["Checkpoint"]
+__all__ = ["ActorCheckpoint"]
 
-WEIGHTS, CONFIG, ACTORS = "model.safetensors", "config.json", "actors.safetensors"
+ACTORS = "actors.safetensors"
 
 
-class Checkpoint(nn.Module, PyTorchModelHubMixin):
-    """A network with a config and actors, saved to and loaded from a folder or the Hugging Face hub.
+class ActorCheckpoint(Checkpoint):
+    """A network of actors, made by `cls(config, actors)`."""
 
-    A subclass is made by `cls(config, actors)` and names what it is in `title`.
-    """
-
-    title: ClassVar[str] = ""
-    config: Any
     actors: Actors
-
-    def saved(self) -> dict[str, Tensor]:
-        """What is written: all of the state unless a subclass leaves something out."""
-        return self.state_dict()
-
-    @property
-    def device(self) -> torch.device:
-        return next(self.parameters()).device
 
     @property
     def n_vertices(self) -> int:
@@ -61,12 +45,8 @@ class Checkpoint(nn.Module, PyTorchModelHubMixin):
         return TriangleMesh(next(iter(self.actors.templates.values())).numpy(), self.actors.faces)
 
     def _save_pretrained(self, save_directory: Path) -> None:
-        state = {name: tensor.detach().cpu().contiguous() for name, tensor in self.saved().items()}
-        with written_whole(save_directory / WEIGHTS) as temporary:
-            save_file(state, temporary)
         write_actors(save_directory / ACTORS, self.actors)
-        with written_whole(save_directory / CONFIG) as temporary:
-            temporary.write_text(json.dumps(asdict(self.config), indent=2) + "\n")
+        super()._save_pretrained(save_directory)
 
     def generate_model_card(self, *args, **kwargs) -> ModelCard:
         """README.md of a saved folder."""
@@ -79,41 +59,9 @@ class Checkpoint(nn.Module, PyTorchModelHubMixin):
         )
 
     @classmethod
-    def _from_pretrained(  # type: ignore[override]
-        cls,
-        *,
-        model_id: str,
-        revision: str | None,
-        cache_dir: str | Path | None,
-        force_download: bool,
-        local_files_only: bool,
-        token: str | bool | None,
-        config: Any = None,
-        map_location: str = "cpu",
-    ) -> "Checkpoint":
-        if config is None:
-            raise FileFormatError(f"{model_id} has no {CONFIG}; expected a folder that save_pretrained wrote")
-
-        def file(name: str) -> Path:
-            if Path(model_id).is_dir():
-                return Path(model_id) / name
-            return Path(
-                hf_hub_download(
-                    repo_id=model_id,
-                    filename=name,
-                    revision=revision,
-                    cache_dir=cache_dir,
-                    force_download=force_download,
-                    token=token,
-                    local_files_only=local_files_only,
-                )
-            )
-
-        actors = read_actors(file(ACTORS))
-        try:
-            state = load_file(file(WEIGHTS), device=map_location)
-            model = cls(config, actors)
-            model.load_state_dict(state)
-        except (OSError, SafetensorError, RuntimeError, MeshanimError) as error:
-            raise FileFormatError(f"{file(WEIGHTS)} is no checkpoint of {cls.title}: {error}") from error
-        return model.to(map_location).eval()
+    def restored(
+        cls, config: Any, state: Mapping[str, Tensor], file: Callable[[str], Path]
+    ) -> "ActorCheckpoint":
+        model = cls(config, read_actors(file(ACTORS)))
+        model.load_state_dict(state)
+        return model

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from meshanim.errors import OptionError, ShapeError
-from meshanim.models.audio2face.checkpoint import Checkpoint
+from meshanim.models.audio2face.checkpoint import ActorCheckpoint
 from meshanim.models.audio2face.schedule import CosineSchedule, FrameNoise
 from meshanim.motion.animation_state import Actors, FacePose
 
@@ -151,7 +151,7 @@ class IdentityExperts(nn.Module):
         return steps + self.second(functional.gelu(hidden))
 
 
-class Audio2FaceDiffusion(Checkpoint):
+class Audio2FaceDiffusion(ActorCheckpoint):
     """X_0 = f(audio, X_t, t, emotion a frame, identity): Eq. 6.
 
     What is generated has, in every frame, the displacements of all skin vertices, the coefficients of the

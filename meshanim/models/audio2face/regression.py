@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from meshanim.errors import OptionError, ShapeError
-from meshanim.models.audio2face.checkpoint import Checkpoint
+from meshanim.models.audio2face.checkpoint import ActorCheckpoint
 from meshanim.models.audio2face.speech import Hearing
 from meshanim.motion.animation_state import Actors
 
@@ -172,7 +172,7 @@ class HybridEncoder(nn.Module):
         return torch.cat([heard[..., 0], spoken.transpose(1, 2)], dim=1)
 
 
-class Audio2FaceRegression(Checkpoint):
+class Audio2FaceRegression(ActorCheckpoint):
     """Half a second of sound, its speech features and an emotion to the animation state of its middle.
 
     Parameters
