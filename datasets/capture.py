@@ -149,6 +149,8 @@ class Capture:
         Pixels a side, as a share of the files'.
     fps : float, optional
         Timesteps a second, where they follow each other as in a video.
+    rest : mapping of str to float
+        Weights of the head's expressions with which the face rests, where zero is not its rest.
     speech : mapping of int to Path
         Sound files by the timestep that they begin with; timestep t of one that begins with s lasts from
         (t - s) / fps to (t - s + 1) / fps seconds.
@@ -169,6 +171,7 @@ class Capture:
     background: tuple[float, float, float] | None = None
     scale: float = 1.0
     fps: float | None = None
+    rest: Mapping[str, float] = field(default_factory=dict, repr=False)
     speech: Mapping[int, Path] = field(default_factory=dict, repr=False)
 
     def __len__(self) -> int:

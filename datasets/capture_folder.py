@@ -9,7 +9,8 @@
                                   translation (T, 3): what is not there is zero; timesteps (T,): the TTTTT of
                                   each row, 0 to T - 1 if not given. May be missing
     DIR/speech/TTTTT.wav          what is heard from timestep TTTTT on, of a video; may be missing
-    DIR/capture.json              name, head, background, regions, splits, fps (of videos); all of it optional
+    DIR/capture.json              name, head, background, regions, splits, fps (of videos), rest (weights of
+                                  expressions with which the face rests); all of it optional
     DIR/offset.npz                static_offset (V, 3): metres, added to the head's template; may be missing
     DIR/surface.npz               the drawn triangles (`HeadSurface`), where they are not the head's own
 
@@ -121,6 +122,7 @@ def read_capture(directory: Path) -> Capture:
         region_names=tuple(record.get("regions", ())),
         background=tuple(record["background"]) if record.get("background") else None,
         fps=record.get("fps"),
+        rest=record.get("rest", {}),
         speech=_speech(directory / SPEECH, rows),
     )
 
@@ -206,6 +208,9 @@ def _read_record(path: Path) -> dict[str, Any]:
     fps = record.get("fps")
     if fps is not None and not (isinstance(fps, int | float) and fps > 0):
         raise FileFormatError(f"{path}: fps is {fps}, expected frames a second")
+    rest = record.get("rest", {})
+    if not (isinstance(rest, dict) and all(isinstance(weight, int | float) for weight in rest.values())):
+        raise FileFormatError(f"{path}: rest is {rest}, expected weights by the names of expressions")
     return record
 
 
@@ -305,6 +310,7 @@ def write_capture(capture: Capture, target: str | Path, progress: bool = False) 
         "background": capture.background,
         "regions": list(capture.region_names),
         "fps": capture.fps,
+        "rest": dict(capture.rest),
         "frames": list(capture.timesteps),
         "splits": splits,
     }

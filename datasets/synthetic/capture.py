@@ -258,6 +258,7 @@ def _plan(corpus: SynthesizeOptions, options: CaptureOptions, job: tuple[int, Pe
         "background": _stored(options.background),
         "regions": list(REGIONS),
         "fps": float(corpus.fps) if chosen.speech else None,
+        "rest": dict(person.rest_expression),
         "frames": [moment.name for moment in moments],
         "splits": splits,
     }

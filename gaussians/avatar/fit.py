@@ -106,6 +106,7 @@ def fit_avatar(options: FitAvatarOptions, progress: bool = True) -> Results:
         latent=settings.color.latent,
         hidden=settings.color.hidden,
         background=behind,
+        rest=capture.rest,
     )
     offset = None if capture.static_offset is None else torch.from_numpy(capture.static_offset)
     avatar = Avatar(

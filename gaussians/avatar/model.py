@@ -3,7 +3,7 @@
 import json
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -52,6 +52,8 @@ class AvatarConfig:
         Of the colour network; latent 0 for none.
     background : (3,) float
         What it was fitted in front of, sRGB in [0, 1].
+    rest : mapping of str to float
+        Weights of the head's expressions with which the face rests, where zero is not its rest.
     """
 
     head: str = "default"
@@ -60,6 +62,7 @@ class AvatarConfig:
     latent: int = 8
     hidden: int = 32
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    rest: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self):
         if self.sh_degree not in range(4) or self.latent < 0 or self.hidden < 1:
@@ -314,6 +317,7 @@ class Avatar(nn.Module):
         if not isinstance(described, dict) or described.get("format") != FORMAT:
             raise FileFormatError(f"{directory / 'config.json'} describes no avatar of meshanim")
         try:
+            described = {"rest": {}} | described  # younger than the format
             known = {part.name: described[part.name] for part in fields(AvatarConfig)}
             tensors = load_file(directory / "avatar.safetensors")
             config = AvatarConfig(

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
+from torch import Tensor
 
 from meshanim.errors import ShapeError
 from meshanim.gaussians.avatar.model import Avatar
@@ -21,9 +22,15 @@ AT_ONCE = 4
 
 
 def avatar_template(avatar: Avatar) -> Float[np.ndarray, "vertices 3"]:
-    """Vertices of the avatar's head at rest, with its own identity, metres."""
+    """Vertices of the avatar's head with its own identity, as its face rests, metres."""
+    rest = avatar.head.expression(avatar.config.rest) if avatar.config.rest else None
+    return _vertices(avatar, rest)
+
+
+def _vertices(avatar: Avatar, expression: Tensor | None = None) -> Float[np.ndarray, "vertices 3"]:
     with torch.no_grad():
-        return avatar.head(HeadParameters(shape=avatar.shape))[0].cpu().numpy()
+        posed = avatar.head(HeadParameters(shape=avatar.shape, expression=expression))
+    return posed[0].cpu().numpy()
 
 
 def on_avatar(avatar: Avatar, sequence: MeshSequence) -> Float[np.ndarray, "frames vertices 3"]:
@@ -92,10 +99,10 @@ def _draw(
     if isinstance(background, np.ndarray) and background.ndim == 3:
         behind, background = torch.as_tensor(background).to(like), (0.0, 0.0, 0.0)
     cameras = cameras.to(like.device).to(like.dtype)
-    vertices, template = on_avatar(avatar, sequence), avatar_template(avatar)
+    vertices = on_avatar(avatar, sequence)
     solve = None
     if avatar.colors is not None and "jawOpen" in avatar.head.expression_names:
-        solve = BlendshapeSolver.from_head(avatar.head, neutral=template).stream()
+        solve = BlendshapeSolver.from_head(avatar.head, neutral=_vertices(avatar)).stream()
     for start in range(0, len(sequence), AT_ONCE):
         part = slice(start, start + AT_ONCE)
         parameters = None

@@ -125,7 +125,7 @@ def _sequence(avatar: Avatar, options: RenderOptions) -> MeshSequence:
         return sequence if fps is None else sequence.resampled(fps)
     assert speech is not None
     animator = Animator.from_pretrained(options.model, avatar.head)
-    return animator(speech, options.performance, progress=sys.stderr.isatty())
+    return animator(speech, options.performance, avatar_template(avatar), progress=sys.stderr.isatty())
 
 
 def _cameras(avatar: Avatar, options: RenderOptions, frames: int, fps: float) -> Cameras:

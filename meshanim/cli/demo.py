@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from tyro.conf import arg
 
-from meshanim.cli.animate import AnimateOptions, Scene, animate, check_size, perform
+from meshanim.cli.animate import AnimateOptions, animate, check_size, perform
 from meshanim.errors import OptionError
 from meshanim.files import check_writable
 from meshanim.heads import DefaultHead, Head
@@ -82,8 +82,7 @@ def side_by_side(
     options : AnimateOptions
         What is said by whom; where no person is given, the avatar's, if it is one of the twelve.
     avatar : Avatar
-        An avatar of the same person has the mesh's very vertices. One of somebody else gets the moves, and
-        has its eyes where the mesh has them.
+        Gets the moves, and has its eyes where the mesh has them: one of the same person the very vertices.
 
     Returns
     -------
@@ -96,23 +95,20 @@ def side_by_side(
     from meshanim.render.lighting import backdrop, developed
 
     scene, sequence = perform(replace(options, person=options.person or _person(avatar)))
-    size, template = options.size, avatar_template(avatar)
-    played, head = sequence, scene.animator.head
+    size, head = options.size, scene.animator.head
     if scene.appearance is not None:
         camera = head_camera(scene.appearance, size, size)
     else:
         camera = portrait_camera(sequence.mesh.vertices, size, size)
     moved = camera
-    if _same_person(scene, avatar):
-        played = replace(sequence, mesh=sequence.mesh.with_vertices(template))
-    elif head is not None:
+    if head is not None:
         shift = np.eye(4)
-        shift[:3, 3] = _eyes(head, sequence.mesh.vertices) - _eyes(avatar.head, template)
+        shift[:3, 3] = _eyes(head, sequence.mesh.vertices) - _eyes(avatar.head, avatar_template(avatar))
         moved = replace(camera, world_to_camera=camera.world_to_camera @ shift)
     behind = developed(backdrop(size, size))
     pairs = zip(
         scene.frames(sequence, size, camera),
-        play(avatar, played, still_camera(moved, len(sequence)), behind),
+        play(avatar, sequence, still_camera(moved, len(sequence)), behind),
     )
     return sequence, (np.concatenate(pair, 1) for pair in pairs)
 
@@ -122,13 +118,6 @@ def _person(avatar: "Avatar") -> str:
 
     name = avatar.config.name.lower()
     return name if name in PEOPLE and isinstance(avatar.head, DefaultHead) else PERSON
-
-
-def _same_person(scene: Scene, avatar: "Avatar") -> bool:
-    """Whether the avatar's head has the person's identity: the template differs by the resting expression."""
-    if scene.appearance is None or not isinstance(avatar.head, DefaultHead):
-        return False
-    return np.array_equal(avatar.shape[0].cpu().numpy(), scene.appearance.shape)
 
 
 def _eyes(head: Head, vertices: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, " 3"]:

@@ -64,6 +64,7 @@ def test_splits_and_names(capture):
     }  # fmt: skip
     assert capture.check() == []
     assert (capture.name, capture.head_name, capture.region_names) == ("Bruno", "default", REGIONS)
+    assert capture.rest == find_person("bruno").rest_expression
     used = {name: {capture.views[i].timestep for i in rows} for name, rows in capture.splits.items()}
     assert used == {"train": {0, 1}, "novel_view": {0}, "novel_expression": {2}}
     seen = {name: {capture.views[i].world_to_camera.tobytes() for i in capture.split(name)} for name in used}

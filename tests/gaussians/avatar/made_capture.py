@@ -90,5 +90,6 @@ def write_capture(directory: Path, background: bool = True, focal: float = 1.7) 
     write_cameras(directory, {f"c{i}": (m, k, SIZE, SIZE) for i, (m, k) in enumerate(zip(*matrices))})
     write_parameters(directory, parameters, range(TIMESTEPS))
     record = {"name": "Ball", "head": avatar.config.head, "regions": ["background", "skin"], "splits": splits}
+    record["rest"] = {"jawOpen": 0.25}
     write_record(directory, record | ({"background": list(BACKGROUND)} if background else {}))
     return avatar

@@ -348,6 +348,7 @@ def test_commands(capture, tiny, tmp_path, capsys):
     assert main(words) == 0
     assert "gaussians" in capsys.readouterr().out
     assert load_file(tmp_path / "run" / "model" / "avatar.safetensors")["means"].dtype == torch.float16
+    assert Avatar.from_pretrained(tmp_path / "run" / "model").config.rest == {"jawOpen": 0.25}
     scores = tmp_path / "scores.json"
     words = ["avatar", "evaluate", str(tmp_path / "run"), str(capture), "--size", "16", "--json", str(scores)]
     assert main(words) == 0

@@ -120,6 +120,33 @@ def test_colours_get_the_weights_that_made_the_vertices(head, avatar):
     torch.testing.assert_close(drive, torch.tensor([0.0, 0.5, 1.0]), atol=0.06, rtol=0)
 
 
+def test_a_face_that_rests_in_an_expression_keeps_it(head, tmp_path):
+    """Moves are added to the resting face, and colours get its weights."""
+    rest = {"mouthSmileLeft": 0.4, "jawOpen": 0.1}
+    torch.manual_seed(0)
+    made = Avatar(AvatarConfig(latent=2, rest=rest), head, face=torch.arange(0, head.mesh.n_faces, 100))
+    made.save_pretrained(tmp_path / "model")
+    resting = Avatar.from_pretrained(tmp_path / "model")
+    assert resting.config == made.config
+    with torch.no_grad():
+        expected = head(HeadParameters(expression=head.expression(rest)))[0].numpy()
+    np.testing.assert_array_equal(avatar_template(resting), expected)
+    sequence = yawn(head)
+    np.testing.assert_allclose(on_avatar(resting, sequence)[0], expected, atol=1e-6)
+    asked = []
+    resting.colors.register_forward_hook(lambda module, inputs, output: asked.append(inputs[1]))
+    list(play(resting, sequence, camera_path("front", expected, 3, 10.0, 16, 16)))
+    drive = torch.cat(asked)[:, [head.expression_names.index(name) for name in rest]]
+    torch.testing.assert_close(drive[:2, 0], torch.full((2,), 0.4), atol=0.08, rtol=0)
+    torch.testing.assert_close(drive[:2, 1], torch.tensor([0.1, 0.6]), atol=0.06, rtol=0)
+
+
+def test_the_packaged_avatar_rests_as_its_person_does(head):
+    packaged = Avatar.from_pretrained("default")
+    person = make_appearance(head, find_person(packaged.config.name))
+    np.testing.assert_allclose(avatar_template(packaged), person.template, atol=1e-6)
+
+
 def run(*words) -> int:
     return main([str(word) for word in words])
 
