@@ -317,7 +317,7 @@ class Avatar(nn.Module):
         if not isinstance(described, dict) or described.get("format") != FORMAT:
             raise FileFormatError(f"{directory / 'config.json'} describes no avatar of meshanim")
         try:
-            described = {"rest": {}} | described  # younger than the format
+            described.setdefault("rest", {})  # younger than the format
             known = {part.name: described[part.name] for part in fields(AvatarConfig)}
             tensors = load_file(directory / "avatar.safetensors")
             config = AvatarConfig(
