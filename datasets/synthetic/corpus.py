@@ -32,7 +32,17 @@ from meshanim.errors import DependencyError, FileFormatError, OptionError
 from meshanim.heads import Head, HeadParameters, load_head
 from meshanim.jobs import run_jobs
 
-__all__ = ["CastMember", "SynthesizeOptions", "Take", "act", "cast", "splits", "synthesize", "takes"]
+__all__ = [
+    "CastMember",
+    "SynthesizeOptions",
+    "Take",
+    "act",
+    "cast",
+    "delivery",
+    "splits",
+    "synthesize",
+    "takes",
+]
 
 _PROSODY_RATE = 100.0
 
@@ -232,8 +242,25 @@ def _name(take: Take) -> str:
     return f"{take.member.name}_sentence{take.sentence:02d}"
 
 
-def _speak(take: Take) -> tuple[Waveform, list[Phoneme]]:
-    """The sentence with some silence before and after it."""
+@dataclass(frozen=True)
+class Delivery:
+    """How a voice says a take: factors on rate, pitch and amplitude, seconds of silence before and after."""
+
+    rate: float
+    pitch: float
+    volume: float
+    before: float
+    after: float
+
+    def around(self, waveform: Waveform) -> Waveform:
+        """The sentence at its amplitude, between its silences."""
+        before, after = (round(seconds * waveform.rate) for seconds in (self.before, self.after))
+        samples = np.pad(waveform.samples * np.float32(self.volume), (before, after))
+        return Waveform(np.clip(samples, -1, 1).astype(np.float32), waveform.rate)
+
+
+def delivery(take: Take) -> Delivery:
+    """What the emotion at its intensity, the speaker and chance make of the voice."""
     feeling = EMOTIONS[take.emotion]
 
     def gain(value: float) -> float:
@@ -242,21 +269,22 @@ def _speak(take: Take) -> tuple[Waveform, list[Phoneme]]:
     generator = np.random.default_rng([*take.seed, 0x5BEA])
     rate = take.member.rate * gain(feeling.rate) * math.exp(generator.normal() * 0.04)
     tone = take.member.pitch * gain(feeling.pitch) * math.exp(generator.normal() * 0.02)
-    waveform, phonemes = synthesize_speech(
-        take.text,
-        take.member.voice,
-        rate=float(np.clip(rate, 0.5, 2.0)),
-        pitch=float(np.clip(tone, 0.5, 2.0)),
-    )
-    before, after = (round(seconds * waveform.rate) for seconds in generator.uniform(0.15, 0.6, size=2))
-    samples = np.pad(waveform.samples * np.float32(gain(feeling.volume)), (before, after))
-    shift = before / waveform.rate
+    before, after = generator.uniform(0.15, 0.6, size=2)
+    rate, tone = (float(np.clip(value, 0.5, 2.0)) for value in (rate, tone))
+    return Delivery(rate, tone, gain(feeling.volume), before, after)
+
+
+def _speak(take: Take) -> tuple[Waveform, list[Phoneme]]:
+    """The sentence with some silence before and after it."""
+    how = delivery(take)
+    waveform, phonemes = synthesize_speech(take.text, take.member.voice, how.rate, how.pitch)
+    shift = round(how.before * waveform.rate) / waveform.rate
     moved = [
         Phoneme(round(p.start + shift, 4), round(p.end + shift, 4), p.symbol)
         for p in phonemes
         if p.symbol != "SIL"
     ]
-    return Waveform(np.clip(samples, -1, 1).astype(np.float32), waveform.rate), moved
+    return how.around(waveform), moved
 
 
 def act(take: Take, fps: float) -> tuple[Waveform, list[Phoneme], Performance]:

@@ -18,7 +18,7 @@ from meshanim.audio.phonemes import Phoneme, align, words_of
 from meshanim.audio.waveform import Waveform, load_waveform
 from meshanim.errors import DependencyError, OptionError, ShapeError
 
-__all__ = ["espeak_pronunciation", "synthesize_speech", "voices"]
+__all__ = ["espeak_pronunciation", "speak", "synthesize_speech", "voices"]
 
 _PACKAGES = {"espeak": "espeakng_loader", "pico": "py_nanotts"}
 _FLITE_PITCH = {"slt": 175, "rms": 95, "awb": 125, "kal16": 105}  # Hz, the voices' own
@@ -89,6 +89,26 @@ def synthesize_speech(
     ShapeError
         If the phonemes cannot be aligned.
     """
+    waveform, events = _spoken(text, voice, rate, pitch, intonation)
+    try:
+        return waveform, align(waveform, text)
+    except ShapeError:
+        if not events:
+            raise
+        return waveform, _from_events(events, waveform.duration)
+
+
+def speak(
+    text: str, voice: str = "pico:en-US", rate: float = 1.0, pitch: float = 1.0, intonation: float = 1.0
+) -> Waveform:
+    """The sound of `synthesize_speech` alone: no phonemes, so no alignment and no pocketsphinx."""
+    return _spoken(text, voice, rate, pitch, intonation)[0]
+
+
+def _spoken(
+    text: str, voice: str, rate: float, pitch: float, intonation: float
+) -> tuple[Waveform, list[tuple[float, str]]]:
+    """16 kHz, peak 0.7, and the engine's phoneme events where it has some."""
     words_of(text)
     for name, value, low in (("rate", rate, 0.5), ("pitch", pitch, 0.5), ("intonation", intonation, 0.0)):
         if not low <= value <= 2:
@@ -115,13 +135,7 @@ def synthesize_speech(
         events = answer["events"]
     else:
         raise OptionError(f"no voice {voice!r}; expected one of voices(), such as {', '.join(voices()[:6])}")
-    waveform = waveform.resampled(16000).levelled()
-    try:
-        return waveform, align(waveform, text)
-    except ShapeError:
-        if not events:
-            raise
-        return waveform, _from_events(events, waveform.duration)
+    return waveform.resampled(16000).levelled(), events
 
 
 def _flite(text: str, name: str, rate: float, pitch: float, intonation: float) -> Waveform:

@@ -24,6 +24,7 @@ from meshanim.datasets.motion_dataset import (
 from meshanim.datasets.pose_augmentation import AugmentPoseOptions, augment_pose
 from meshanim.datasets.synthetic.capture import CaptureOptions, synthesize_capture
 from meshanim.datasets.synthetic.corpus import SynthesizeOptions, synthesize
+from meshanim.datasets.synthetic.emotional_speech import EmotionalSpeechOptions, speak_emotions
 from meshanim.datasets.vhap import write_vhap
 from meshanim.errors import FileFormatError, MeshanimError, OptionError
 from meshanim.export import write_rig
@@ -410,6 +411,10 @@ def _cache_features(options: CacheFeaturesOptions) -> None:
     print(f"wrote {cache_features(options, progress=sys.stderr.isatty())}")
 
 
+def _emotional_speech(options: EmotionalSpeechOptions) -> None:
+    print(f"wrote {speak_emotions(options, progress=sys.stderr.isatty())}")
+
+
 def _personalize(options: PersonalizeOptions) -> None:
     target = load_mesh(options.target, scale=options.scale)
     landmarks = None if options.landmarks is None else _landmarks(options.landmarks)
@@ -439,4 +444,5 @@ COMMANDS = {
     "a2f": _states,
     "cache-features": _cache_features,
     "personalize": _personalize,
+    "emotional-speech": _emotional_speech,
 }

@@ -1,6 +1,6 @@
-"""Names of the emotions that Audio2Face-3D knows."""
+"""Names of the emotions that Audio2Face-3D is told, and of those that are heard in speech."""
 
-__all__ = ["EMOTIONS"]
+__all__ = ["EMOTIONS", "HEARD_EMOTIONS"]
 
 EMOTIONS = (
     "amazement",
@@ -15,3 +15,6 @@ EMOTIONS = (
     "sadness",
 )
 """Audio2Face-3D's emotions (Sec. 3.1) but neutral, which is none of them."""
+
+HEARD_EMOTIONS = ("anger", "disgust", "fear", "joy", "neutral", "sadness")
+"""The classes of Audio2Emotion (App. A.1)."""
