@@ -184,10 +184,10 @@ def load_encoder(name: str = "visemes") -> SpeechEncoder:
     Parameters
     ----------
     name : str
-        "visemes" (the default, trained, streams), "mel" (no weights, streams), "phones" (pocketsphinx, extra
-        `speech`), "visemes+phones" (both, files only), "wav2vec2:PATH" or "hubert:PATH" (a local folder or a
-        hub id, extra `encoders`; "wav2vec2:PATH@6" takes hidden layer 6), "features:FILE" or
-        "features:FILE@RATE" (a .npy file).
+        "visemes" (the default, trained, streams), "visemes:hidden" (the channels before its posteriors),
+        "mel" (no weights, streams), "phones" (pocketsphinx, extra `speech`), "visemes+phones" (both, files
+        only), "wav2vec2:PATH" or "hubert:PATH" (a local folder or a hub id, extra `encoders`;
+        "wav2vec2:PATH@6" takes hidden layer 6), "features:FILE" or "features:FILE@RATE" (a .npy file).
 
     Raises
     ------
@@ -201,10 +201,10 @@ def load_encoder(name: str = "visemes") -> SpeechEncoder:
     kind, _, path = name.partition(":")
     if kind == "mel" and not path:
         return MelEncoder()
-    if name == "visemes":
+    if name in ("visemes", "visemes:hidden"):
         from meshanim.audio.visemes import VisemeEncoder
 
-        return VisemeEncoder()
+        return VisemeEncoder(outputs="hidden" if path else "posteriors")
     if name in ("phones", "visemes+phones"):
         from meshanim.audio.phones import FusedEncoder, PhoneEncoder
 

@@ -251,7 +251,7 @@ class VisemeEncoder(SpeechEncoder):
         self.outputs = outputs
         self.normalization = normalization
         self.prior = prior
-        self.name = "visemes"
+        self.name = "visemes:hidden" if outputs == "hidden" else "visemes"
         self.rate = DEFAULT_MEL.fps / 2
         self.dim = self.net.config.width if outputs == "hidden" else len(PHONEMES) + len(VISEMES)
         self.bilabial = len(PHONEMES) + VISEMES.index("bmp") if outputs == "posteriors" else None

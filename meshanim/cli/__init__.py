@@ -21,6 +21,7 @@ VERBS = {
     "evaluate": "score models and motion on held-out data, compare scores: gava, a2f, motion, ...",
     "avatar": "Gaussian avatars: fit to pictures, evaluate on held-out ones, render",
     "data": "data sets: synthesize, info, check, convert, augment-pose, personalize, ...",
+    "emotion": "speech in, the emotions that are heard in it out, over time",
     "solve": "the motion of a mesh in, blendshape weights out",
     "export": "networks for other programs: onnx",
     "serve": "speech in, blendshape weights out over a network: grpc",

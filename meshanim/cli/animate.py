@@ -12,7 +12,7 @@ from tqdm import tqdm
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from meshanim.animator import AnimationOptions, Animator
-from meshanim.audio import load_waveform
+from meshanim.audio import Waveform, load_waveform
 from meshanim.errors import OptionError
 from meshanim.export.usd import USD_ENDINGS
 from meshanim.files import check_writable
@@ -24,7 +24,16 @@ from meshanim.motion.blendshape_track import BlendshapeTrack
 from meshanim.motion.solve_sequence import arkit_only, solve_sequence
 from meshanim.render import Camera
 
-__all__ = ["COMMANDS", "AnimateOptions", "Scene", "animate", "announce", "check_size", "perform"]
+__all__ = [
+    "COMMANDS",
+    "AnimateOptions",
+    "Scene",
+    "animate",
+    "announce",
+    "check_size",
+    "heard_performance",
+    "perform",
+]
 
 RECORDED = (".csv", ".npz")
 ENDINGS = (".mp4", ".glb", ".npz", ".png", ".csv", *USD_ENDINGS)
@@ -45,6 +54,8 @@ class AnimateOptions:
     output: Annotated[Path, arg(aliases=["-o"])] = Path("talk.mp4")
     """The ending chooses: mp4 (with sound), glb (any glTF viewer), npz (vertices, pose, fps), png (contact
     sheet), csv (blendshape weights, solved), usda or usdc (the face, its shapes and weights; extra usd)."""
+    neutral: Path | None = None
+    """With --emotion auto, which hears the emotion in the speech: neutral speech of the same voice."""
     csv: CsvForm = "audio2face"
     """Whose columns a csv has: of Audio2Face-3D or of Live Link Face."""
     model: str = "default"
@@ -111,12 +122,32 @@ def perform(options: AnimateOptions) -> tuple["Scene", MeshSequence]:
     if options.sound is not None:
         raise OptionError("--sound goes with motion from a .csv or .npz; a sound file is its own")
     speech = load_waveform(options.speech, rate=None)
-    if options.performance.track is not None:
-        stream = animator.open(speech.rate, options.performance, scene.template)
+    performance = heard_performance(animator, speech, options.performance, options.neutral)
+    if performance.track is not None:
+        stream = animator.open(speech.rate, performance, scene.template)
         if stream.without_effect:
             print(f"this head does not follow {', '.join(stream.without_effect)}", file=sys.stderr)
-    sequence = animator(speech, options.performance, scene.template, progress=sys.stderr.isatty())
+    sequence = animator(speech, performance, scene.template, progress=sys.stderr.isatty())
     return scene, sequence
+
+
+def heard_performance(
+    animator: Animator, speech: Waveform, performance: AnimationOptions, neutral: Path | None = None
+) -> AnimationOptions:
+    """The options, with what is heard in the speech where the emotion is "auto"."""
+    if performance.emotion != "auto":
+        if neutral is not None:
+            raise OptionError("--neutral goes with --emotion auto")
+        return performance
+    from meshanim.automatic_emotion import with_heard_emotions
+    from meshanim.models.audio2emotion import EmotionDetector, load_audio2emotion
+
+    sample = None if neutral is None else load_waveform(neutral)
+    detector = EmotionDetector(load_audio2emotion(), neutral=sample)
+    heard = with_heard_emotions(animator.model, speech, performance, detector)
+    what = "over time" if heard.emotions is not None else f"{heard.emotion} at {heard.intensity:.2f}"
+    print(f"emotion: {what}, heard by the default classifier (trained on synthetic voices)")
+    return heard
 
 
 def _animate_avatar(avatar: str, options: AnimateOptions) -> None:

@@ -12,7 +12,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from meshanim.animator import AnimationOptions, Animator
 from meshanim.audio import load_waveform
-from meshanim.cli.animate import announce, check_size
+from meshanim.cli.animate import announce, check_size, heard_performance
 from meshanim.errors import OptionError
 from meshanim.files import check_writable
 from meshanim.gaussians.avatar.evaluation import EvaluateAvatarOptions, evaluate_avatar
@@ -125,7 +125,8 @@ def _sequence(avatar: Avatar, options: RenderOptions) -> MeshSequence:
         return sequence if fps is None else sequence.resampled(fps)
     assert speech is not None
     animator = Animator.from_pretrained(options.model, avatar.head)
-    return animator(speech, options.performance, avatar_template(avatar), progress=sys.stderr.isatty())
+    performance = heard_performance(animator, speech, options.performance)
+    return animator(speech, performance, avatar_template(avatar), progress=sys.stderr.isatty())
 
 
 def _cameras(avatar: Avatar, options: RenderOptions, frames: int, fps: float) -> Cameras:

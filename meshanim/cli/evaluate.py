@@ -5,6 +5,11 @@ import sys
 from meshanim.audio.viseme_evaluation import EvaluateVisemesOptions, evaluate_visemes
 from meshanim.comparison import CompareOptions, compare, comparison_results, comparison_table
 from meshanim.results import Results
+from meshanim.training.audio2emotion_evaluation import (
+    EvaluateEmotionOptions,
+    confusion_table,
+    evaluate_emotion,
+)
 from meshanim.training.audio2face_evaluation import EvaluateAudio2FaceOptions, evaluate_audio2face
 from meshanim.training.folder_evaluation import EvaluateMotionOptions, evaluate_motion
 from meshanim.training.gava_ablation import AblationOptions, ablation_table, gava_ablation
@@ -49,6 +54,17 @@ def _compare(options: CompareOptions) -> None:
         comparison_results(differences).save(options.json)
 
 
+def _emotion(options: EvaluateEmotionOptions) -> None:
+    results, confusion = evaluate_emotion(
+        options.model, options.clips(), options.fine_tune, options.seed, progress=sys.stderr.isatty()
+    )
+    print(results.table())
+    for way, matrix in confusion.items():
+        print(f"\n{way}:\n{confusion_table(matrix)}")
+    if options.json is not None:
+        results.save(options.json)
+
+
 def _visemes(options: EvaluateVisemesOptions) -> None:
     print(evaluate_visemes(options, progress=sys.stderr.isatty()).table())
 
@@ -60,5 +76,6 @@ COMMANDS = {
     "gava-maps": _gava_maps,
     "motion": _motion,
     "visemes": _visemes,
+    "audio2emotion": _emotion,
     "compare": _compare,
 }

@@ -41,10 +41,11 @@ class TrainConfig:
         Peak of the schedule.
     warmup : int
         Steps of linear warm-up.
-    schedule : "constant", "cosine" or "steps"
-        After the warm-up; cosine ends at `floor`, steps multiplies by `decay` every `decay_steps` steps.
+    schedule : "constant", "cosine", "linear" or "steps"
+        After the warm-up; cosine and linear end at `floor`, steps multiplies by `decay` every `decay_steps`
+        steps.
     floor : float
-        Factor on the learning rate that the cosine ends at.
+        Factor on the learning rate that cosine and linear end at.
     decay, decay_steps : float, int
         Of the schedule "steps".
     weight_decay : float
@@ -75,7 +76,7 @@ class TrainConfig:
     steps: int = 70_000
     learning_rate: float = 1e-4
     warmup: int = 0
-    schedule: Literal["constant", "cosine", "steps"] = "constant"
+    schedule: Literal["constant", "cosine", "linear", "steps"] = "constant"
     floor: float = 0.0
     decay: float = 1.0
     decay_steps: int = 1
@@ -131,6 +132,8 @@ def learning_rate_factor(config: TrainConfig, step: int) -> float:
     if config.schedule == "steps":
         return config.decay ** ((step - config.warmup) // config.decay_steps)
     progress = (step - config.warmup) / max(config.steps - config.warmup, 1)
+    if config.schedule == "linear":
+        return 1 + (config.floor - 1) * min(progress, 1.0)
     return config.floor + (1 - config.floor) * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
 
 
