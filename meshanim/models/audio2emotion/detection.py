@@ -15,9 +15,10 @@ from meshanim.audio import SpeechEncoder, Waveform
 from meshanim.errors import FileFormatError, OptionError, ShapeError
 from meshanim.files import written_whole
 from meshanim.models.audio2emotion.features import RATE, EmotionFeatures
-from meshanim.models.audio2emotion.network import CONFIG, Audio2Emotion
+from meshanim.models.audio2emotion.network import Audio2Emotion
 from meshanim.models.audio2emotion.postprocessing import EmotionOptions, EmotionPostProcessor
 from meshanim.models.audio2face.speech import EmotionTrack
+from meshanim.models.checkpoint import CONFIG
 from meshanim.motion.emotions import EMOTIONS, HEARD_EMOTIONS
 
 __all__ = [

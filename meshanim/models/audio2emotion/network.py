@@ -1,24 +1,16 @@
 """The classifier: features of a stretch of speech, and of a neutral one of the same voice, to logits."""
 
-import json
-from dataclasses import asdict, dataclass
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass
 
 import torch
-from huggingface_hub import PyTorchModelHubMixin, hf_hub_download
 from jaxtyping import Float
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from meshanim.errors import FileFormatError, MeshanimError, OptionError
-from meshanim.files import written_whole
+from meshanim.errors import OptionError
+from meshanim.models.checkpoint import Checkpoint
 from meshanim.motion.emotions import HEARD_EMOTIONS
 
 __all__ = ["Audio2Emotion", "Audio2EmotionConfig"]
-
-WEIGHTS, CONFIG = "model.safetensors", "config.json"
 
 
 @dataclass(frozen=True)
@@ -60,7 +52,7 @@ class Audio2EmotionConfig:
             raise OptionError("crop and reference must be seconds above 0, silence not negative")
 
 
-class Audio2Emotion(nn.Module, PyTorchModelHubMixin):
+class Audio2Emotion(Checkpoint):
     """Frozen features, two convolutions over time, attentive statistics pooling, two linear layers.
 
     The paper trains wav2vec 2.0's transformer with the classifier; here the encoder stays as it is.
@@ -69,6 +61,8 @@ class Audio2Emotion(nn.Module, PyTorchModelHubMixin):
     ----------
     config : Audio2EmotionConfig
     """
+
+    title = "Audio2Emotion"
 
     def __init__(self, config: Audio2EmotionConfig):
         super().__init__()
@@ -126,50 +120,3 @@ class Audio2Emotion(nn.Module, PyTorchModelHubMixin):
             flag = heard.new_ones(len(heard), 1) if known is None else known[:, None]
             change = flag * (heard - self._pooled(reference))
         return self.classify(torch.cat([heard, change, flag], 1))
-
-    def _save_pretrained(self, save_directory: Path) -> None:
-        state = {name: tensor.detach().cpu().contiguous() for name, tensor in self.state_dict().items()}
-        with written_whole(save_directory / WEIGHTS) as temporary:
-            save_file(state, temporary)
-        with written_whole(save_directory / CONFIG) as temporary:
-            temporary.write_text(
-                json.dumps({"model": "audio2emotion", **asdict(self.config)}, indent=2) + "\n"
-            )
-
-    @classmethod
-    def _from_pretrained(  # type: ignore[override]
-        cls,
-        *,
-        model_id: str,
-        revision: str | None,
-        cache_dir: str | Path | None,
-        force_download: bool,
-        local_files_only: bool,
-        token: str | bool | None,
-        map_location: str = "cpu",
-        **_: Any,
-    ) -> "Audio2Emotion":
-        def file(name: str) -> Path:
-            if Path(model_id).is_dir():
-                return Path(model_id) / name
-            return Path(
-                hf_hub_download(
-                    repo_id=model_id,
-                    filename=name,
-                    revision=revision,
-                    cache_dir=cache_dir,
-                    force_download=force_download,
-                    token=token,
-                    local_files_only=local_files_only,
-                )
-            )
-
-        try:
-            config = json.loads(file(CONFIG).read_text(encoding="utf-8"))
-            if config.pop("model", None) != "audio2emotion":
-                raise FileFormatError(f"{model_id} is no checkpoint of Audio2Emotion")
-            model = cls(Audio2EmotionConfig(**config))
-            model.load_state_dict(load_file(file(WEIGHTS), device=map_location))
-        except (OSError, ValueError, TypeError, SafetensorError, RuntimeError, MeshanimError) as error:
-            raise FileFormatError(f"{model_id} is no checkpoint of Audio2Emotion: {error}") from error
-        return model.to(map_location).eval()
