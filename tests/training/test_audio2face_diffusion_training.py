@@ -71,8 +71,11 @@ def test_it_learns_to_take_the_noise_away(states, monkeypatch, tmp_path):
     assert mean_loss(task, network) < 0.6 * mean_loss(task, fresh)
 
 
-@pytest.mark.parametrize("changes", [{}, {"head_motion": True}, {"target": "rig", "experts": 8}])
-def test_a_run_goes_on_where_it_was_cut(states, tmp_path, changes):
+@pytest.mark.parametrize(
+    "changes", [{}, {"head_motion": True}, {"target": "rig", "experts": 8}, {"text": True}], ids=str
+)
+def test_a_run_goes_on_where_it_was_cut(states, tmp_path, monkeypatch, changes):
+    monkeypatch.setattr(training, "load_text_encoder", lambda name: Words())
     train = TrainConfig(steps=4, learning_rate=1e-3, accumulation=2, log_every=1000, save_every=2)
     whole = train_diffusion(options(states, tmp_path / "whole", train=train, **changes), progress=False)
     cut = tmp_path / "cut"
