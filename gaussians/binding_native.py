@@ -153,13 +153,18 @@ def _(vertices, means, quaternions, scales, *others):
 
 def _setup(ctx, inputs, output) -> None:
     ctx.save_for_backward(*inputs, output[3])
+    ctx.set_materialize_grads(False)  # zeros for output[3], which nobody differentiates
 
 
-def _differentiate(ctx, grad_means: Tensor, grad_quaternions: Tensor, grad_scales: Tensor, _):
-    to_vertices = ctx.needs_input_grad[0]
-    grad_vertices, *grads = _backward(
-        *ctx.saved_tensors, grad_means, grad_quaternions, grad_scales, to_vertices
-    )
+def _differentiate(
+    ctx, grad_means: Tensor | None, grad_quaternions: Tensor | None, grad_scales: Tensor | None, _
+):
+    to_vertices, (vertices, means, quaternions, scales, *_) = ctx.needs_input_grad[0], ctx.saved_tensors
+    arriving = [
+        field.new_zeros(len(vertices), *field.shape[1:]) if grad is None else grad
+        for field, grad in ((means, grad_means), (quaternions, grad_quaternions), (scales, grad_scales))
+    ]
+    grad_vertices, *grads = _backward(*ctx.saved_tensors, *arriving, to_vertices)
     return grad_vertices if to_vertices else None, *grads, *(None,) * 6
 
 

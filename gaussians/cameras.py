@@ -70,6 +70,8 @@ class Cameras:
             matrix.to(*device_or_dtype)  # type: ignore[call-overload]
             for matrix in (self.world_to_camera, self.intrinsics)
         )
+        if world_to_camera is self.world_to_camera and intrinsics is self.intrinsics:
+            return self
         return Cameras(world_to_camera, intrinsics, self.width, self.height)
 
     @property

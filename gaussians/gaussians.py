@@ -1,6 +1,6 @@
 """`Gaussians`: what a scene of 3D Gaussians is, before anything renders, binds or fits it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields
 
 import torch
@@ -82,7 +82,7 @@ class Gaussians:
         if self.sh is not None and self.sh.shape[-2] not in _HARMONICS:
             raise ShapeError(f"sh must have 1, 4, 9 or 16 coefficients, not {self.sh.shape[-2]}")
         try:
-            torch.broadcast_shapes(*self._batches().values())
+            _together(self._batches().values())
         except RuntimeError as error:
             shapes = ", ".join(f"{name} {tuple(shape)}" for name, shape in self._batches().items())
             raise ShapeError(f"batch dimensions do not fit together: {shapes}") from error
@@ -104,7 +104,7 @@ class Gaussians:
     @property
     def batch_shape(self) -> torch.Size:
         """The batch that all fields together span."""
-        return torch.broadcast_shapes(*self._batches().values())
+        return _together(self._batches().values())
 
     @property
     def sh_degree(self) -> int | None:
@@ -151,3 +151,9 @@ class Gaussians:
             for name in names.pop()
         }
         return cls(**joined)
+
+
+def _together(shapes: Iterable[torch.Size]) -> torch.Size:
+    """`torch.broadcast_shapes`, at once where all are equal."""
+    distinct = set(shapes)
+    return distinct.pop() if len(distinct) == 1 else torch.broadcast_shapes(*distinct)

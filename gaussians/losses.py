@@ -131,6 +131,7 @@ def _(rendered, target, mask, ssim_weight, keep):
 def _save(ctx, inputs, output):
     ctx.save_for_backward(output[1])
     ctx.mark_non_differentiable(output[1])
+    ctx.set_materialize_grads(False)  # zeros as large as the image for it
 
 
 def _backward(ctx, grad_loss, _):

@@ -10,6 +10,7 @@ from meshanim.gaussians.avatar.colors_native import available, color_network
 __all__ = ["ExpressionColors"]
 
 BACKENDS = ("auto", "native", "reference")
+Y0 = 0.28209479177387814  # the constant harmonic
 
 
 class ExpressionColors(nn.Module):
@@ -61,6 +62,31 @@ class ExpressionColors(nn.Module):
             return color_network(latents, frame, self.by_latent, self.inner, self.inner_bias, self.outer)
         hidden = torch.relu(latents @ self.by_latent + frame[:, None])
         return torch.relu(hidden @ self.inner + self.inner_bias) @ self.outer
+
+    def harmonics(
+        self,
+        latents: Float[Tensor, "n latent"],
+        expression: Float[Tensor, "batch expression"],
+        sh0: Float[Tensor, "n 1 3"],
+        sh_rest: Float[Tensor, "n rest 3"],
+        backend: str = "auto",
+    ) -> Float[Tensor, "batch n coefficients 3"]:
+        """Harmonics whose colour is changed by the residual; natively they are written in the same pass.
+
+        Parameters
+        ----------
+        latents, expression, backend
+            As in `forward`.
+        sh0, sh_rest : (N, 1, 3), (N, R, 3)
+            The constant harmonic, which gets the residual, and the others.
+        """
+        if _choose(backend, latents) == "native":
+            frame = expression @ self.by_expression + self.bias
+            network = self.by_latent, self.inner, self.inner_bias, self.outer
+            rows = color_network(latents, frame, *network, sh0.flatten(1), sh_rest.flatten(1), 1 / Y0)
+            return rows.unflatten(-1, (-1, 3))
+        changed = sh0 + self(latents, expression, backend)[..., None, :] / Y0
+        return torch.cat([changed, sh_rest.expand(len(changed), -1, -1, -1)], -2)
 
 
 def _choose(backend: str, latents: Tensor) -> str:

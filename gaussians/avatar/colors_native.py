@@ -25,30 +25,47 @@ def color_network(
     inner: Float32[Tensor, "hidden hidden"],
     inner_bias: Float32[Tensor, " hidden"],
     outer: Float32[Tensor, "hidden 3"],
-) -> Float32[Tensor, "batch n 3"]:
-    """relu(relu(frame + latents by_latent) inner + inner_bias) outer, differentiable in everything.
+    constant: Float32[Tensor, "n 3"] | None = None,
+    others: Float32[Tensor, "n rest"] | None = None,
+    scale: float = 1.0,
+) -> Float32[Tensor, "batch n three_and_rest"]:
+    """[constant + scale relu(relu(frame + latents by_latent) inner + inner_bias) outer; others].
 
-    The hidden layers stay in the cache, tile by tile, and are computed again for the gradients.
+    Differentiable in all tensors. The hidden layers stay in the cache, tile by tile, and are computed again
+    for the gradients.
     """
-    given = (latents, frame, by_latent, inner, inner_bias, outer)
-    return _ColorNetwork.apply(*(tensor.contiguous() for tensor in given))
+    others = latents.new_empty(len(latents), 0) if others is None else others
+    given = (latents, frame, by_latent, inner, inner_bias, outer, constant, others)
+    return _ColorNetwork.apply(scale, *(None if tensor is None else tensor.contiguous() for tensor in given))
 
 
 class _ColorNetwork(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, latents, frame, *weights):
-        ctx.save_for_backward(latents, frame, *weights)
-        out = latents.new_empty(len(frame), len(latents), 3)
-        arrays = (tensor.detach().numpy() for tensor in (latents, frame, *weights))
-        _native.color_network(*arrays, torch.get_num_threads(), out.numpy())
+    def forward(ctx, scale, *given):
+        latents, frame, *_, others = given
+        ctx.save_for_backward(*given)
+        ctx.scale = scale
+        out = latents.new_empty(len(frame), len(latents), 3 + others.shape[1])
+        _native.color_network(*map(_array, given), scale, torch.get_num_threads(), out.numpy())
         return out
 
     @staticmethod
     @once_differentiable
     def backward(ctx, grad_out):
         given = ctx.saved_tensors
-        gradients = [torch.empty_like(tensor) for tensor in given]
-        arrays = (tensor.detach().numpy() for tensor in (*given, grad_out.contiguous()))
-        out = (tensor.numpy() for tensor in gradients)
-        _native.color_network_backward(*arrays, torch.get_num_threads(), *out)
-        return tuple(gradients)
+        gradients = [None if tensor is None else torch.empty_like(tensor) for tensor in given]
+        for place in (-2, -1):
+            if not ctx.needs_input_grad[place]:
+                gradients[place] = None
+        _native.color_network_backward(
+            *map(_array, given),
+            ctx.scale,
+            _array(grad_out.contiguous()),
+            torch.get_num_threads(),
+            *map(_array, gradients),
+        )
+        return None, *gradients
+
+
+def _array(tensor: Tensor | None):
+    return None if tensor is None else tensor.detach().numpy()

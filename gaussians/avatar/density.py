@@ -40,12 +40,16 @@ class DensityStatistics(nn.Module):
             setattr(self, name, getattr(self, name).new_zeros(count))
 
     def add(
-        self, gradient: Float[Tensor, " n"], visible: Bool[Tensor, " n"], radius: Int[Tensor, " n"]
+        self,
+        gradient: Float[Tensor, " n"],
+        visible: Bool[Tensor, " n"],
+        radius: Int[Tensor, " n"] | None = None,
     ) -> None:
-        """Count one picture."""
+        """Count one picture; without radii where the rule has no use for them."""
         self.gradient += torch.where(visible, gradient, 0.0)
         self.seen += visible
-        self.radius = torch.maximum(self.radius, torch.where(visible, radius, 0))
+        if radius is not None:
+            self.radius = torch.maximum(self.radius, torch.where(visible, radius, 0))
 
     def _load_from_state_dict(self, state_dict, prefix, *more):
         self.clear(len(state_dict[prefix + "seen"]))

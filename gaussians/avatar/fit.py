@@ -232,7 +232,7 @@ class AvatarTask:
         half: bool = False,
     ):
         self.store, self.views, self.settings, self.seed, self.half = store, views, settings, seed, half
-        self.seen: tuple[Gaussians, Rendering] | None = None
+        self.seen: tuple[Gaussians, Rendering, Tensor] | None = None
         self._order: tuple[int, np.ndarray] | None = None
 
     def batch(self, number: int, share: int = 0, shares: int = 1) -> Mapping[str, Any]:
@@ -259,13 +259,11 @@ class AvatarTask:
         rendering = avatar.draw(world, cameras, depth=None, screen_gradients=screen)
         if not screen and world.means.requires_grad:
             world.means.retain_grad()
-        self.seen = world, rendering
-        rendered = rendering.rgb[0]
-        loss = image_loss(rendered, batch["image"], self.settings.ssim_weight)
+        self.seen = world, rendering, batch["image"]
+        loss = image_loss(rendering.rgb[0], batch["image"], self.settings.ssim_weight)
         visible = rendering.radii[0].amax(-1) > 0 if screen else None
         kept = regularization(avatar, self.settings.regularizers, visible)
-        mse = (rendered.detach() - batch["image"]).square().mean()
-        return loss + kept, {"psnr": -10 * torch.log10(mse), "image": loss, "regularizers": kept}
+        return loss + kept, {"image": loss, "regularizers": kept}
 
     def save(self, model: nn.Module, directory: Path) -> None:
         """The avatar's files, and tracking.safetensors: how the head was posed."""
@@ -323,8 +321,8 @@ class AvatarTrainer(Trainer):
         assert isinstance(model, AvatarLearner)
         model.to(self.accelerator.device)
         tracked = model.tracking if model.refine_tracking else None
-        optimizer = make_optimizer(model.avatar, tracked, self.settings, self.extent)
-        return model, self.accelerator.prepare(optimizer)
+        # Accelerate's wrapper, like its `backward`, searches the disk for a package at every step.
+        return model, make_optimizer(model.avatar, tracked, self.settings, self.extent)
 
     def _optimizer_step(self, batches: Iterator[Mapping[str, Any]], clock: Any) -> dict[str, Tensor]:
         settings, model = self.settings, self.model
@@ -335,7 +333,7 @@ class AvatarTrainer(Trainer):
         with clock.waiting():
             batch = self._to_device(next(batches))
         loss, terms = self.avatar_task.loss(model, batch)
-        self.accelerator.backward(loss)
+        loss.backward()
         if self.accelerator.num_processes > 1:
             self._average_gradients()
         done = self.step + 1
@@ -347,7 +345,7 @@ class AvatarTrainer(Trainer):
             self._refine(done)
         if self.reset_every and done % self.reset_every == 0 and done < self.config.steps:
             reset_opacities(model.avatar)
-            forget_opacities(self.optimizer.optimizer, model.avatar)
+            forget_opacities(self.optimizer, model.avatar)
         return {"loss": loss, "gaussians": torch.tensor(float(len(model.avatar))), **terms}
 
     def _sh_degree(self) -> int:
@@ -366,19 +364,18 @@ class AvatarTrainer(Trainer):
     @torch.no_grad()
     def _observe(self) -> None:
         assert self.avatar_task.seen is not None
-        world, rendering = self.avatar_task.seen
+        world, rendering, _ = self.avatar_task.seen
         if rendering.screen_offsets is None:
             assert world.means.grad is not None
             length = world.means.grad.norm(dim=-1)
-            visible, radius = length > 0, torch.zeros(len(world), dtype=torch.int32, device=length.device)
+            self.model.statistics.add(length, length > 0)
         else:
             assert rendering.screen_offsets.grad is not None
             height, width = rendering.rgb.shape[-3:-1]
             halves = rendering.screen_offsets.new_tensor([width / 2, height / 2])
             length = (rendering.screen_offsets.grad[0] * halves).norm(dim=-1)
             radius = rendering.radii[0].amax(-1)
-            visible = radius > 0
-        self.model.statistics.add(length, visible, radius)
+            self.model.statistics.add(length, radius > 0, radius)
 
     def _refine(self, done: int) -> None:
         statistics = self.model.statistics
@@ -397,12 +394,18 @@ class AvatarTrainer(Trainer):
             was_reset=bool(self.reset_every) and done > self.reset_every,
             seed=self.config.seed * 1_000_003 + done,
         )
-        carry(self.optimizer.optimizer, self.model.avatar, refined)
+        carry(self.optimizer, self.model.avatar, refined)
+
+    def _logged(self, logs: Mapping[str, Tensor]) -> dict[str, float]:
+        assert self.avatar_task.seen is not None
+        _, rendering, image = self.avatar_task.seen
+        mse = (rendering.rgb[0].detach() - image).square().mean()
+        return super()._logged({**logs, "psnr": -10 * torch.log10(mse)})
 
     def _report(self, writer: Any, values: Mapping[str, float]) -> None:
         super()._report(writer, values)
         if self.avatar_task.seen is not None and self.step % (20 * self.config.log_every) == 0:
-            _, rendering = self.avatar_task.seen
+            _, rendering, _ = self.avatar_task.seen
             shown = rendering.rgb[0].detach().clamp(0, 1).cpu()
             writer.add_image("rendered", shown.numpy(), self.step, dataformats="HWC")
 

@@ -29,7 +29,6 @@ __all__ = ["GAUSSIAN_FIELDS", "Avatar", "AvatarConfig"]
 GAUSSIAN_FIELDS = ("means", "scales", "rotations", "opacities", "sh0", "sh_rest", "latents")
 """Parameters with a row a Gaussian: means in units of the triangle, logarithms of scales, quaternions, logits
 of opacities, harmonics, what the colour network reads."""
-Y0 = 0.28209479177387814  # the constant harmonic
 INPUTS = ("expression", "jaw", "eyes")
 WIDTHS = {"jaw": 3, "eyes": 6}
 FORMAT = "meshanim avatar 1"
@@ -189,26 +188,27 @@ class Avatar(nn.Module):
             parameters, vertices = posed, self.vertices(posed)
         else:
             vertices = self._on_surface(posed)
-        change = None
+        sh = None
         if self.colors is not None:
             drive = self.drive(HeadParameters() if parameters is None else parameters)
-            change = self.colors(self.latents, drive)[..., None, :] / Y0
-            change = change[0] if vertices.ndim == 2 else change
-        return self.binding.to_world(self.local(change), vertices)
+            sh = self.colors.harmonics(self.latents, drive, self.sh0, self._sh_rest)
+            sh = sh[0] if vertices.ndim == 2 else sh
+        return self.binding.to_world(self.local(sh), vertices)
 
-    def local(self, change: Float[Tensor, "*batch n 1 3"] | None = None) -> Gaussians:
+    def local(self, sh: Float[Tensor, "*batch n coefficients 3"] | None = None) -> Gaussians:
         """The activated Gaussians in the frames of their triangles.
 
         Parameters
         ----------
-        change : (..., N, 1, 3), optional
-            Added to the constant harmonic: what an expression does to the colours.
+        sh : (..., N, K, 3), optional
+            Harmonics; without what expression adds if not given.
         """
-        sh = self.sh0 if change is None else self.sh0 + change
-        rest = self.sh_rest[:, : (self.sh_degree + 1) ** 2 - 1]
-        if rest.shape[1]:
-            sh = torch.cat([sh, rest.expand(*sh.shape[:-2], -1, -1)], -2)
+        sh = torch.cat([self.sh0, self._sh_rest], 1) if sh is None else sh
         return Gaussians(self.means, self.rotations, self.scales.exp(), torch.sigmoid(self.opacities), sh=sh)
+
+    @property
+    def _sh_rest(self) -> Tensor:
+        return self.sh_rest[:, : (self.sh_degree + 1) ** 2 - 1]
 
     def vertices(self, parameters: HeadParameters) -> Float[Tensor, "batch vertices 3"]:
         """The surface posed by parameters; the avatar's own identity where they have none."""

@@ -90,6 +90,7 @@ class PictureStore:
     def __init__(self, capture: Capture, behind: tuple[float, float, float] | None = None):
         self.capture, self.behind = capture, behind
         self._kept: dict[tuple[int, bool], Tensor] = {}
+        self._cameras: dict[tuple[int, bool], Cameras] = {}
         self._bytes = 0
 
     def image(self, index: int, half: bool = False) -> Float[Tensor, "height width 3"]:
@@ -104,12 +105,14 @@ class PictureStore:
 
     def cameras(self, index: int, half: bool = False) -> Cameras:
         """The camera of a picture."""
-        view = self.capture.views[index]
-        view = view.scaled(0.5) if half else view
-        pose, intrinsics = (
-            torch.from_numpy(m).float()[None] for m in (view.world_to_camera, view.intrinsics)
-        )
-        return Cameras(pose, intrinsics, view.width, view.height)
+        if (index, half) not in self._cameras:
+            view = self.capture.views[index]
+            view = view.scaled(0.5) if half else view
+            pose, intrinsics = (
+                torch.from_numpy(m).float()[None] for m in (view.world_to_camera, view.intrinsics)
+            )
+            self._cameras[index, half] = Cameras(pose, intrinsics, view.width, view.height)
+        return self._cameras[index, half]
 
     def _decoded(self, index: int, half: bool) -> Tensor:
         picture = self.capture[index]

@@ -1,11 +1,13 @@
 // A network of two hidden layers over many rows, for the colours of Gaussians (gaussians/avatar/colors.py):
 //     out = relu(relu(frame + latents by_latent) inner + inner_bias) outer
 // The frame's part of the first layer is given; all rows of a frame share it. Rows are contiguous floats.
+// What is written are harmonics: `constant` + scale out, then `rest` as it is.
 #pragma once
 #include <cstdint>
 
 struct ColorSizes {
     int64_t frames, rows, latent, hidden;
+    int64_t rest;  // floats a row beside the three of the network
     int threads;
 };
 
@@ -17,11 +19,15 @@ struct ColorNetwork {
     const float *inner;       // (hidden, hidden)
     const float *inner_bias;  // (hidden)
     const float *outer;       // (hidden, 3)
+    const float *constant;    // (rows, 3); null for zeros
+    const float *others;      // (rows, rest)
+    float scale;
 };
 
 struct ColorGradients {
-    const float *grad_out;  // (frames, rows, 3)
+    const float *grad_out;  // (frames, rows, 3 + rest)
     float *latents, *frame, *by_latent, *inner, *inner_bias, *outer;
+    float *constant, *others;  // null where nobody asks
 };
 
 // Rows of a tile, and of a chunk, whose gradients of the weights are summed apart: the same for any number of threads.

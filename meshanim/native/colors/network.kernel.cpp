@@ -161,8 +161,11 @@ struct Tile {
         unpack(n.latents + begin * n.sizes.latent, count, n.sizes.latent, latents, w.latent);
     }
 
-    void read_gradients(const Weights &w, const float *grad_out, int64_t count) {
-        unpack(grad_out, count, 3, to_colors, w.out);
+    void read_gradients(const ColorNetwork &n, const Weights &w, const float *grad_out, int64_t count) {
+        const int64_t width = 3 + n.sizes.rest;
+        for (int64_t row = 0; row < count; ++row)
+            for (int64_t part = 0; part < 3; ++part) to_colors[row * w.out + part] = n.scale * grad_out[row * width + part];
+        std::fill(to_colors + count * w.out, to_colors + TILE * w.out, 0.0f);
     }
 
     void hide(const Weights &w, int64_t frame) {
@@ -174,6 +177,16 @@ struct Tile {
 
     void color(const Weights &w) {
         multiply({second, w.hidden, 1}, {w.outer, w.out}, {colors, w.out, TILE, w.sizes.hidden, w.out}, nullptr, 0, Plain{});
+    }
+
+    void write(const ColorNetwork &n, const Weights &w, int64_t begin, int64_t count, float *out) const {
+        const int64_t rest = n.sizes.rest;
+        for (int64_t row = 0; row < count; ++row, out += 3 + rest) {
+            const float *const constant = n.constant ? n.constant + 3 * (begin + row) : nullptr;
+            for (int64_t part = 0; part < 3; ++part)
+                out[part] = n.scale * colors[row * w.out + part] + (constant ? constant[part] : 0.0f);
+            std::copy_n(n.others + rest * (begin + row), rest, out + 3);
+        }
     }
 
   private:
@@ -227,13 +240,30 @@ void backward_tile(const Weights &w, Tile &t, Sums &sums, int64_t frame) {
     add_rows(t.to_first, h, sums.frame + frame * h);
 }
 
+// Columns first to first + columns of the gradient, which go on as they are; summed over frames.
+void pass_on(const float *grad_out, int64_t width, int64_t first, int64_t columns, int64_t count, int64_t frame, float *to) {
+    if (!to) return;
+    for (int64_t row = 0; row < count; ++row) {
+        const float *const from = grad_out + row * width + first;
+        float *const at = to + row * columns;
+        if (frame)
+            for (int64_t part = 0; part < columns; ++part) at[part] += from[part];
+        else
+            std::copy_n(from, columns, at);
+    }
+}
+
 void backward_chunk(const ColorNetwork &n, const ColorGradients &g, const Weights &w, Tile &t, Sums &sums, int64_t chunk) {
     const int64_t rows = n.sizes.rows, end = std::min(rows, (chunk + 1) * CHUNK), latent = n.sizes.latent;
+    const int64_t width = 3 + n.sizes.rest;
     for (int64_t begin = chunk * CHUNK; begin < end; begin += TILE) {
         const int64_t count = std::min(TILE, end - begin);
         t.read(n, w, begin, count);
         for (int64_t frame = 0; frame < n.sizes.frames; ++frame) {
-            t.read_gradients(w, g.grad_out + 3 * (frame * rows + begin), count);
+            const float *const grad_out = g.grad_out + width * (frame * rows + begin);
+            t.read_gradients(n, w, grad_out, count);
+            pass_on(grad_out, width, 0, 3, count, frame, g.constant ? g.constant + 3 * begin : nullptr);
+            pass_on(grad_out, width, 3, width - 3, count, frame, g.others ? g.others + (width - 3) * begin : nullptr);
             backward_tile(w, t, sums, frame);
             for (int64_t row = 0; row < count; ++row)
                 for (int64_t part = 0; part < latent; ++part) {
@@ -264,7 +294,7 @@ void color_network(const ColorNetwork &n, float *out, float *workspace) {
             for (int64_t frame = 0; frame < n.sizes.frames; ++frame) {
                 tile.hide(w, frame);
                 tile.color(w);
-                unpad(tile.colors, count, 3, w.out, out + 3 * (frame * n.sizes.rows + begin));
+                tile.write(n, w, begin, count, out + (3 + n.sizes.rest) * (frame * n.sizes.rows + begin));
             }
         }
     }

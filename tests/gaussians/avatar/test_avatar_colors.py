@@ -61,6 +61,27 @@ def test_equals_the_reference(instruction_set, count, frames, latent, hidden):
         assert (ours.double() - theirs).norm() <= 2e-5 * theirs.norm() + 1e-12
 
 
+@pytest.mark.parametrize(("count", "frames", "rest"), [(70, 1, 8), (2100, 3, 3), (5, 2, 0)])
+def test_harmonics_equal_the_reference(instruction_set, count, frames, rest):
+    network, latents, expression = scene(count, frames)
+    generator = torch.Generator().manual_seed(2)
+    constant, others = (torch.randn(count, k, 3, generator=generator).double() for k in (1, rest))
+
+    def both(backend, dtype):
+        leaves = [t.to(dtype).clone().requires_grad_() for t in (latents, constant, others)]
+        network.to(dtype)
+        sh = network.harmonics(leaves[0], expression.to(dtype), *leaves[1:], backend=backend)
+        weights = torch.randn(sh.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+        wanted = [*leaves, *network.parameters()]
+        return [sh.detach(), *torch.autograd.grad((weights.to(sh) * sh).sum(), wanted)]
+
+    exact = both("reference", torch.float64)
+    assert exact[0].shape == (frames, count, 1 + rest, 3)
+    for ours, theirs in zip(both("native", torch.float32), exact, strict=True):
+        assert ours.shape == theirs.shape
+        assert (ours.double() - theirs).norm() <= 2e-5 * theirs.norm() + 1e-12
+
+
 def test_no_gaussians_and_no_gradient_asked_for(instruction_set):
     network, latents, expression = scene(0, 2)
     out = run(network.float(), latents.float(), expression.float(), "native")
