@@ -12,14 +12,17 @@ import torch
 from torch import Tensor
 
 from meshanim.attention.benchmark import closed_mesh_faces
+from meshanim.gaussians.binding import bind
 from meshanim.gaussians.cameras import Cameras
 from meshanim.gaussians.gaussians import Gaussians
+from meshanim.gaussians.losses import image_loss
 from meshanim.gaussians.splat.functional import rasterize
 from meshanim.gaussians.splat.native import work
 from meshanim.gaussians.splat.rendering import DepthMode
+from meshanim.geometry import TriangleMesh
 from meshanim.results import Results
 
-__all__ = ["SplatBenchmark", "run", "workload"]
+__all__ = ["SplatBenchmark", "run", "training_step", "workload"]
 
 # Floating-point operations a pixel and Gaussian, counted by hand, a fused multiply-add as two: exponent 10,
 # exponential 12, light 4, colours 6; backward once more the first three, colour behind 9, nine sums 18.
@@ -28,7 +31,7 @@ FORWARD, BACKWARD = 32, 53
 
 @dataclass(frozen=True)
 class SplatBenchmark:
-    """Time of Gaussian splatting, against torch and the processor's peak.
+    """Time of Gaussian splatting, against torch and the processor's peak, and of a whole training step.
 
     Example: meshanim bench splat --json splat.json
     """
@@ -59,13 +62,8 @@ def workload(count: int, size: int, seed: int = 0) -> tuple[Gaussians, Cameras]:
     Each pixel on it lies in about 40 Gaussians; opacities are 0.5 to 0.9.
     """
     generator = np.random.default_rng(seed)
-    faces = generator.permutation(closed_mesh_faces(count // 2 + 2))[:count]
-    n = faces.max() + 1
-    angle = np.pi * (3 - 5**0.5) * np.arange(n)
-    height = 1 - 2 * (np.arange(n) + 0.5) / n
-    radius = np.sqrt(1 - height**2) * (1 + 0.04 * np.sin(5 * height) * np.cos(4 * angle))
-    vertices = np.stack([0.78 * radius * np.cos(angle), height, 0.88 * radius * np.sin(angle)], 1)
-    corners = vertices[faces]
+    mesh = _surface(count, generator)
+    corners = mesh.vertices[mesh.faces]
     along = corners[:, 1] - corners[:, 0]
     normals = np.cross(along, corners[:, 2] - corners[:, 0])
     edge = np.sqrt(np.median(np.linalg.norm(normals, axis=1)))
@@ -89,6 +87,49 @@ def workload(count: int, size: int, seed: int = 0) -> tuple[Gaussians, Cameras]:
     k = torch.tensor([[2.2 * size, 0, size / 2], [0, 2.2 * size, size / 2], [0, 0, 1]])
     scene = Gaussians(**{name: torch.from_numpy(field).float() for name, field in fields.items()})
     return scene, Cameras(pose[None], k[None], size, size)
+
+
+def _surface(count: int, generator: np.random.Generator) -> TriangleMesh:
+    faces = generator.permutation(closed_mesh_faces(count // 2 + 2))[:count]
+    n = faces.max() + 1
+    angle = np.pi * (3 - 5**0.5) * np.arange(n)
+    height = 1 - 2 * (np.arange(n) + 0.5) / n
+    radius = np.sqrt(1 - height**2) * (1 + 0.04 * np.sin(5 * height) * np.cos(4 * angle))
+    vertices = np.stack([0.78 * radius * np.cos(angle), height, 0.88 * radius * np.sin(angle)], 1)
+    return TriangleMesh(vertices, faces)
+
+
+def training_step(count: int, size: int, seed: int = 0) -> Callable[[], Tensor]:
+    """A step that fits the workload, bound to its triangles and disturbed, to its own picture.
+
+    Local Gaussians are activated, taken to the world by the posed mesh and rendered; the gradient of 0.8 L1 +
+    0.2 D-SSIM moves means, scales, rotations, opacities and colours by Adam. Calling it returns the loss.
+    """
+    scene, cameras = workload(count, size, seed)
+    with torch.no_grad():
+        target = rasterize(scene, cameras, depth=None).rgb
+    mesh = _surface(count, np.random.default_rng(seed))
+    binding, vertices = bind(mesh), torch.from_numpy(mesh.vertices).float()
+    local = binding.to_local(scene, vertices)
+    assert scene.colors is not None
+    start = local.means, local.scales.log(), local.quaternions, torch.logit(local.opacities), scene.colors
+    generator = torch.Generator().manual_seed(seed)
+    leaves = [
+        (field + 0.05 * torch.randn(field.shape, generator=generator)).requires_grad_() for field in start
+    ]
+    optimizer = torch.optim.Adam(leaves, lr=1e-3, eps=1e-15, fused=True)
+
+    def step() -> Tensor:
+        means, scales, quaternions, opacities, colors = leaves
+        bound = Gaussians(means, quaternions, scales.exp(), torch.sigmoid(opacities), colors)
+        rendered = rasterize(binding.to_world(bound, vertices), cameras, depth=None).rgb
+        loss = image_loss(rendered, target)
+        loss.backward()
+        optimizer.step()
+        optimizer.zero_grad()
+        return loss.detach()
+
+    return step
 
 
 def _measure(options: SplatBenchmark, count: int, size: int, results: Results) -> None:
@@ -116,6 +157,7 @@ def _measure(options: SplatBenchmark, count: int, size: int, results: Results) -
         ("native", "forward"): forward("native"),
         ("native", "forward with depth"): forward("native", depth="expected"),
         ("native", "forward + backward"): both("native"),
+        ("native", "training step"): training_step(count, size, options.seed),
     }
     medians = _medians(runs, options.repeats)
     case = f"{count:,} Gaussians, {size} x {size}"
@@ -127,6 +169,7 @@ def _measure(options: SplatBenchmark, count: int, size: int, results: Results) -
         medians |= _medians(slow, 3)
     for (name, metric), milliseconds in medians.items():
         results.add(case, name, metric, milliseconds, "ms")
+    results.add(case, "native", "training steps", 1e3 / medians["native", "training step"], "1/s")
     for metric in ("forward", "forward + backward"):
         if ("reference", metric) in medians:
             ratio = medians["reference", metric] / medians["native", metric]

@@ -3,7 +3,7 @@ import torch
 
 from meshanim.gaussians import rasterize
 from meshanim.gaussians.splat import native
-from meshanim.gaussians.splat.benchmark import SplatBenchmark, run, workload
+from meshanim.gaussians.splat.benchmark import SplatBenchmark, run, training_step, workload
 
 
 def test_workload_is_a_surface_in_view():
@@ -26,3 +26,11 @@ def test_rows_and_ratios():
     area = rasterize(scene, views, depth=None).radii.double().clamp_min(1).prod(-1).sum() * torch.pi
     assert 0.2 * float(area) < pairs < 4 * float(area)
     assert 0 < results.value(case, "native", "forward of peak") < 100
+    milliseconds = results.value(case, "native", "training step")
+    assert results.value(case, "native", "training steps") == pytest.approx(1e3 / milliseconds)
+
+
+def test_the_training_step_learns():
+    step = training_step(600, 48)
+    losses = [float(step()) for _ in range(40)]
+    assert losses[-1] < 0.8 * losses[0]
