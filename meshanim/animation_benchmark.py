@@ -2,6 +2,7 @@
 
 import resource
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from meshanim.animator import AnimationOptions, Animator
 from meshanim.audio import Waveform, load_waveform
 from meshanim.results import Results
 
-__all__ = ["AnimationBenchmark", "run"]
+__all__ = ["AnimationBenchmark", "frames_per_second", "repeated", "run"]
 
 
 @dataclass(frozen=True)
@@ -49,10 +50,10 @@ def run(options: AnimationBenchmark, clip: Path) -> Results:
     animator = Animator.from_pretrained(options.model)
     results.add("load", options.model, "time", time.perf_counter() - start, "s")
     speech = load_waveform(clip)
-    _frames_per_second(animator, _repeated(speech, 1))  # warm up
+    frames_per_second(animator, repeated(speech, 1))  # warm up
     for seconds in options.seconds:
         rates = [
-            _frames_per_second(animator, _repeated(speech, seconds))
+            frames_per_second(animator, repeated(speech, seconds))
             for _ in range(options.repeats if seconds <= 60 else 1)
         ]
         case = f"{seconds} s of speech, {animator.mesh.n_vertices} vertices"
@@ -63,18 +64,22 @@ def run(options: AnimationBenchmark, clip: Path) -> Results:
     return results
 
 
-def _repeated(speech: Waveform, seconds: int) -> Waveform:
+def repeated(speech: Waveform, seconds: int) -> Waveform:
+    """So many seconds of a speech over and over."""
     count = seconds * speech.rate
     return Waveform(np.resize(speech.samples, count), speech.rate)
 
 
-def _frames_per_second(animator: Animator, speech: Waveform) -> float:
-    start = time.perf_counter()
+def frames_per_second(
+    animator: Animator, speech: Waveform, clock: Callable[[], float] = time.perf_counter
+) -> float:
+    """Speed on a whole speech, a second of sound at a time, encoder included."""
+    start = clock()
     stream, frames = animator.open(speech.rate), 0
     for offset in range(0, len(speech.samples), speech.rate):
         frames += len(stream.push(speech.samples[offset : offset + speech.rate]).pose)
     frames += len(stream.finish().pose)
-    return frames / (time.perf_counter() - start)
+    return frames / (clock() - start)
 
 
 def _sound_needed(animator: Animator, speech: Waveform) -> float:

@@ -198,7 +198,7 @@ class GavaPerformance(Performance):
             template=template,
             style=model.style_of(options.subject, options.emotion, options.intensity),
             fps=options.fps,
-            seal=seal,
+            seal=None if seal is None else seal.to(model.surface.template.device),
             bilabial=None if seal is None else getattr(encoder, "bilabial", None),
         )
         self.fps, self.template = self.frames.fps, self.frames.template

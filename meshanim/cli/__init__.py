@@ -25,7 +25,7 @@ VERBS = {
     "solve": "the motion of a mesh in, blendshape weights out",
     "export": "networks for other programs: onnx",
     "serve": "speech in, blendshape weights out over a network: grpc",
-    "bench": "measurements that anyone can repeat: attention, animate, binding, image-loss, solve",
+    "bench": "measurements that anyone can repeat: attention, animate, binding, image-loss, realtime, solve",
     "doctor": "what is installed, which backends work, how to get what is missing",
 }
 # Threads that wait by spinning slow each other down many times where other programs want the cores too.

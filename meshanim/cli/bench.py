@@ -9,6 +9,7 @@ from meshanim.cli.demo import CLIP
 from meshanim.gaussians.binding_benchmark import BindingBenchmark
 from meshanim.gaussians.loss_benchmark import LossBenchmark
 from meshanim.gaussians.splat.benchmark import SplatBenchmark
+from meshanim.realtime_benchmark import RealtimeBenchmark
 from meshanim.results import Results
 from meshanim.solve_benchmark import SolveBenchmark
 
@@ -43,6 +44,13 @@ def _image_loss(options: LossBenchmark) -> None:
     _report(loss_benchmark.run(options), options.json)
 
 
+def _realtime(options: RealtimeBenchmark) -> None:
+    from meshanim import realtime_benchmark
+
+    with as_file(files("meshanim").joinpath(CLIP)) as clip:
+        _report(realtime_benchmark.run(options, clip), options.json)
+
+
 def _solve(options: SolveBenchmark) -> None:
     from meshanim import solve_benchmark
 
@@ -68,6 +76,7 @@ COMMANDS = {
     "animate": _animate,
     "binding": _binding,
     "image-loss": _image_loss,
+    "realtime": _realtime,
     "solve": _solve,
     "splat": _splat,
 }

@@ -1,6 +1,6 @@
 """Lips that seal: the last millimetres between the lips are closed where speech says p, b or m."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -142,6 +142,12 @@ class LipSeal:
             raise OptionError("the closing field does not bring the lip pairs together")
         # One unit closes the mean gap by one metre.
         object.__setattr__(self, "closing", self.closing / -change)
+
+    def to(self, device: torch.device | str) -> "LipSeal":
+        """On another device."""
+        if self.closing.device == torch.device(device):
+            return self
+        return replace(self, pairs=self.pairs.to(device), closing=self.closing.to(device))
 
     def look_ahead(self, fps: float) -> int:
         """Frames that have to be known after the last one that can be sealed."""
