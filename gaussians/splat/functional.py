@@ -143,7 +143,7 @@ def _check_cameras(gaussians: Gaussians, cameras: Cameras) -> None:
 def _background(background: Sequence[float] | Tensor | None, gaussians: Gaussians, images: tuple) -> Tensor:
     channels = 3 if gaussians.colors is None else gaussians.colors.shape[-1]
     if background is None:
-        return gaussians.means.new_zeros(()).expand(*images, channels)
+        return gaussians.means.new_zeros((*images, channels))
     behind = torch.as_tensor(background, dtype=gaussians.means.dtype, device=gaussians.means.device)
     try:
         if behind.shape[-1] != channels:

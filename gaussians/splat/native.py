@@ -1,8 +1,10 @@
 """The C++ rasteriser under autograd."""
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -28,6 +30,7 @@ POOLED = 1 << 18
 class _Views(NamedTuple):
     """What the kernels need besides tensors."""
 
+    images: torch.Size
     coefficients: int
     cameras: int
     width: int
@@ -61,51 +64,55 @@ def rasterize_native(
     """
     if cameras.intrinsics.requires_grad and torch.is_grad_enabled():
         raise OptionError("backend 'native' has no gradients to intrinsics: use backend='reference'")
-    images = background.shape[:-1]
-    tensors, views = _inputs(gaussians, cameras, background, options)
-    finite, rgb, alpha, depth, radii = _Rasterize.apply(*tensors, screen_offsets, views)
+    fields, views = _inputs(gaussians, cameras, background, options)
+    if torch.is_grad_enabled() and any(
+        tensor is not None and tensor.requires_grad for tensor in (*fields, screen_offsets)
+    ):
+        finite, rgb, alpha, depth, radii = _Rasterize.apply(*fields, screen_offsets, views)
+    else:
+        finite, rgb, alpha, depth, radii, _ = _render(fields, views)
     if not finite:
         check_values(gaussians)
         raise OptionError("a Gaussian's projection overflows float32: use backend='reference'")
     if options.depth == "expected":
         depth = depth / alpha.clamp_min(1e-10)
-    size = (*images, cameras.height, cameras.width)
-    return Rendering(
-        rgb.unflatten(0, images),
-        alpha.view(size),
-        None if depth is None else depth.view(size),
-        screen_offsets,
-        radii.view(*images, len(gaussians), 2),
-    )
+    return Rendering(rgb, alpha, depth, screen_offsets, radii)
 
 
 def work(gaussians: Gaussians, cameras: Cameras) -> int:
     """How many pairs of pixel and Gaussian the kernels compute for these images, for benchmarks."""
     background = gaussians.means.new_zeros(len(cameras), 3)
     options = RasterOptions(0.01, 1e10, 0.3, False, 0.999, None)
-    *_, state = _native.splat_forward(_scene(*_inputs(gaussians, cameras, background, options)))
+    *_, state = _render(*_inputs(gaussians, cameras, background, options))
     return _native.splat_pairs(state)
 
 
 def _inputs(
     gaussians: Gaussians, cameras: Cameras, background: Tensor, options: RasterOptions
 ) -> tuple[list[Tensor], _Views]:
-    """Tensors in the order of `_INPUTS`, without the offsets, as the kernels read them."""
+    """Tensors in the order of `_INPUTS`, without the offsets: each has the whole batch or none."""
     images = background.shape[:-1]
-    colors = gaussians.colors if gaussians.sh is None else gaussians.sh.flatten(-2)
+    colors = gaussians.colors if gaussians.sh is None else gaussians.sh
     assert colors is not None
-    tensors = [
-        *(
-            _frames(field, 2, images[:-1])
-            for field in (gaussians.means, gaussians.quaternions, gaussians.scales)
-        ),
-        _frames(gaussians.opacities, 1, images[:-1]),
-        _frames(colors, 2, images[:-1]),
-        cameras.world_to_camera.expand(*images, 4, 4).reshape(-1, 4, 4).contiguous(),
-        cameras.intrinsics.expand(*images, 3, 3).reshape(-1, 3, 3).contiguous(),
-        background.reshape(-1, background.shape[-1]).contiguous(),
+    of_frame = (
+        (gaussians.means, 2),
+        (gaussians.quaternions, 2),
+        (gaussians.scales, 2),
+        (gaussians.opacities, 1),
+        (colors, 2 if gaussians.sh is None else 3),
+    )
+    fields = [
+        field if field.ndim == dimensions else _batched(field, images[:-1], dimensions)
+        for field, dimensions in of_frame
     ]
+    poses, intrinsics = cameras.world_to_camera, cameras.intrinsics
+    if poses.shape[:-2] != images:
+        poses = poses.expand(*images, 4, 4)
+    if intrinsics.shape[:-2] != images:
+        intrinsics = intrinsics.expand(*images, 3, 3)
+    fields += [poses, intrinsics, background]
     views = _Views(
+        images,
         0 if gaussians.sh is None else gaussians.sh.shape[-2],
         len(cameras),
         cameras.width,
@@ -117,85 +124,94 @@ def _inputs(
         options.antialiased,
         options.depth is not None,
     )
-    return tensors, views
+    return fields, views
 
 
-def _frames(field: Tensor, dimensions: int, batch: torch.Size) -> Tensor:
-    """(1 or frames, N, ...): a field that all frames share stays as it is."""
+def _batched(field: Tensor, batch: torch.Size, dimensions: int) -> Tensor:
+    """The field, repeated if it has only a part of the batch: one that all share stays as it is."""
     own, rest = field.shape[: field.ndim - dimensions], field.shape[field.ndim - dimensions :]
-    if math.prod(own) not in (1, math.prod(batch)):
-        field, own = field.expand(*batch, *rest), batch
-    return field.reshape(math.prod(own), *rest).contiguous()
+    return field if math.prod(own) in (1, math.prod(batch)) else field.expand(*batch, *rest)
+
+
+def _render(fields: Sequence[Tensor], views: _Views):
+    """(finite, rgb, alpha, depth or None, radii, state), outside autograd."""
+    finite, planes, radii, state = _native.splat_forward(_scene(fields, views))
+    size, channels = (views.height, views.width), fields[7].shape[-1]
+    planes, radii = planes.view(*views.images, -1, *size), radii.view(*views.images, -1, 2)
+    alpha = planes.select(-3, -1)
+    depth = planes.select(-3, channels) if views.depth else None
+    return finite, planes.narrow(-3, 0, channels).movedim(-3, -1), alpha, depth, radii, state
 
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx, means, quaternions, scales, opacities, colors, poses, intrinsics, background, offsets, views
-    ):
-        tensors = means, quaternions, scales, opacities, colors, poses, intrinsics, background
-        finite, planes, radii, state = _native.splat_forward(_scene(tensors, views))
-        channels = background.shape[-1]
-        rgb = planes[:, :channels].permute(0, 2, 3, 1)
-        depth = planes[:, channels] if views.depth else None
+    def forward(ctx, *given):
+        *fields, offsets, views = given
+        *outputs, state = _render(fields, views)
         ctx.set_materialize_grads(False)
-        ctx.mark_non_differentiable(radii)
-        ctx.save_for_backward(*tensors, state)
-        ctx.views, ctx.offsets = views, None if offsets is None else offsets.shape
-        return finite, rgb, planes[:, -1], depth, radii
+        ctx.mark_non_differentiable(outputs[-1])
+        ctx.save_for_backward(*fields, state)
+        ctx.batch_dimensions, ctx.offsets = (
+            len(views.images),
+            torch.Size() if offsets is None else offsets.shape,
+        )
+        return tuple(outputs)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, _, grad_rgb, grad_alpha, grad_depth, __):
-        *tensors, state = ctx.saved_tensors
-        wanted = dict(zip(_INPUTS, ctx.needs_input_grad))
-        shapes = dict(zip(_INPUTS, (tensor.shape for tensor in tensors))) | {"offsets": ctx.offsets}
-        grads = {name: _empty(shapes[name]) if wanted[name] else None for name in _INPUTS}
-        _native.splat_backward(
-            _scene(tensors, ctx.views),
-            state,
-            grad_rgb,
-            grad_alpha,
-            grad_depth,
-            *(grads[name] for name in ("means", "quaternions", "scales", "opacities", "colors")),
-            grads["offsets"],
-            grads["background"],
-            grads["poses"],
+        *fields, state = ctx.saved_tensors
+        shapes = [*(field.shape for field in fields), ctx.offsets]
+        grads = [_empty(shape) if wanted else None for shape, wanted in zip(shapes, ctx.needs_input_grad)]
+        means, quaternions, scales, opacities, colors, poses, _, background, offsets = map(_array, grads)
+        last = ctx.batch_dimensions - 1
+        of_images = (
+            None if g is None else g.flatten(0, last).numpy() for g in (grad_rgb, grad_alpha, grad_depth)
         )
-        return *grads.values(), None
+        _native.splat_backward(
+            state.numpy(),
+            *of_images,
+            means,
+            quaternions,
+            scales,
+            opacities,
+            colors,
+            offsets,
+            background,
+            poses,
+        )
+        return *grads, None
 
 
-_INPUTS = (
-    "means",
-    "quaternions",
-    "scales",
-    "opacities",
-    "colors",
-    "poses",
-    "intrinsics",
-    "background",
-    "offsets",
-)
-
-
-def _scene(tensors: tuple[Tensor, ...] | list[Tensor], views: _Views):
+def _scene(fields: Sequence[Tensor], views: _Views):
     means, quaternions, scales, opacities, colors, poses, intrinsics, background = (
-        tensor.detach().numpy() for tensor in tensors
+        field.detach().contiguous().numpy() for field in fields
     )
+    n, coefficients = means.shape[-2], views.coefficients
     return _native.SplatScene(
-        means,
-        quaternions,
-        scales,
-        opacities,
-        colors,
-        views.coefficients,
-        poses,
-        intrinsics,
-        background,
-        *views[1:],
+        _rows(means, n, 3),
+        _rows(quaternions, n, 4),
+        _rows(scales, n, 3),
+        _rows(opacities, n),
+        _rows(colors, n, 3 * coefficients or colors.shape[-1]),
+        coefficients,
+        _rows(poses, 4, 4),
+        _rows(intrinsics, 3, 3),
+        _rows(background, background.shape[-1]),
+        *views[2:],
         torch.get_num_threads(),
     )
 
 
+def _rows(array: np.ndarray, *rest: int) -> np.ndarray:
+    """Its leading dimensions as one. Explicit, for -1 is ambiguous where there are no Gaussians."""
+    each = math.prod(rest)
+    return array.reshape(array.size // each if each else 1, *rest)
+
+
 def _empty(shape: torch.Size) -> Tensor:
     return _native.empty(shape) if math.prod(shape) >= POOLED else torch.empty(shape)
+
+
+def _array(tensor: Tensor | None) -> np.ndarray | None:
+    return None if tensor is None else tensor.numpy()

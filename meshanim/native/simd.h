@@ -34,12 +34,18 @@ inline void stream(float *p, Floats a) { _mm512_stream_ps(p, a); }
 inline Floats load_first(const float *p, int n) { return _mm512_maskz_loadu_ps(first_lanes(n), p); }
 inline void store_first(float *p, Floats a, int n) { _mm512_mask_storeu_ps(p, first_lanes(n), a); }
 inline Floats fma(Floats a, Floats b, Floats c) { return _mm512_fmadd_ps(a, b, c); }
+inline Floats fnma(Floats a, Floats b, Floats c) { return _mm512_fnmadd_ps(a, b, c); }  // c - a b
 inline Floats maximum(Floats a, Floats b) { return _mm512_max_ps(a, b); }  // b on NaN
 inline Floats minimum(Floats a, Floats b) { return _mm512_min_ps(a, b); }  // b on NaN
 inline Floats round(Floats a) { return _mm512_roundscale_ps(a, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC); }
 inline Floats square_root(Floats a) { return _mm512_sqrt_ps(a); }
+inline Floats magnitude(Floats a) { return _mm512_andnot_ps(_mm512_set1_ps(-0.0f), a); }
+inline Floats negative(Floats a) { return _mm512_or_ps(_mm512_set1_ps(-0.0f), a); }  // minus the magnitude
 // a times two to the power n, n whole and within +-300.
 inline Floats scale_by_power(Floats a, Floats n) { return _mm512_scalef_ps(a, n); }
+
+// Lane i is p[offsets[i]].
+inline Floats gather(const float *p, const int32_t *offsets) { return _mm512_i32gather_ps(_mm512_loadu_si512(offsets), p, 4); }
 
 // The lanes moved down by `distance` (a power of two), those that fall out coming in at the top.
 inline Floats rotate(Floats a, int distance) {
@@ -91,16 +97,19 @@ inline Floats split(Floats a, Floats &exponent) {
     exponent = _mm512_cvtepi32_ps(n);
     return _mm512_castsi512_ps(_mm512_sub_epi32(bits, _mm512_slli_epi32(n, 23)));
 }
-// 2^x for x in [-126, 127] within 2 ulp; minimax polynomial on [0, 1) (error 8e-8).
+// 2^x for x in [-126, 127] within 2 ulp: a table of 2^(i / 32), which is two registers, and 2^r for |r| <= 1 / 64 by
+// a polynomial of degree 2 (error 6e-8).
 inline Floats exp2(Floats x) {
-    const Floats r = _mm512_reduce_ps(x, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC);
-    Floats p = broadcast(1.877576671e-03f);
-    p = fma(p, r, broadcast(8.989340101e-03f));
-    p = fma(p, r, broadcast(5.582631804e-02f));
-    p = fma(p, r, broadcast(2.401536170e-01f));
-    p = fma(p, r, broadcast(6.931530732e-01f));
-    p = fma(p, r, broadcast(9.999999251e-01f));
-    return _mm512_scalef_ps(p, x);
+    alignas(64) static constexpr float POWERS[32] = {
+        1.0f, 1.0218972f, 1.04427373f, 1.06714046f, 1.09050775f, 1.1143868f, 1.13878858f, 1.1637249f,
+        1.18920708f, 1.21524739f, 1.24185777f, 1.26905096f, 1.29683959f, 1.32523668f, 1.35425556f, 1.38390994f,
+        1.41421354f, 1.44518077f, 1.47682619f, 1.50916445f, 1.54221082f, 1.5759809f, 1.61049032f, 1.64575553f,
+        1.68179286f, 1.71861935f, 1.75625217f, 1.79470909f, 1.8340081f, 1.87416768f, 1.91520655f, 1.95714414f};
+    const Floats grid = broadcast(393216.0f), shifted = x + grid;   // whose last bits are 32 x, rounded
+    const Floats whole = shifted - grid, r = x - whole;
+    const Floats power = _mm512_permutex2var_ps(_mm512_load_ps(POWERS), _mm512_castps_si512(shifted), _mm512_load_ps(POWERS + 16));
+    const Floats slope = fma(broadcast(2.402265e-01f), r, broadcast(6.931573e-01f));
+    return _mm512_scalef_ps(fma(power * r, slope, power), whole);
 }
 
 // Lane i of row j becomes lane j of row i.
@@ -166,9 +175,12 @@ inline void stream(float *p, Floats a) { _mm256_stream_ps(p, a); }
 inline Floats load_first(const float *p, int n) { return _mm256_maskload_ps(p, first_lanes(n)); }
 inline void store_first(float *p, Floats a, int n) { _mm256_maskstore_ps(p, first_lanes(n), a); }
 inline Floats fma(Floats a, Floats b, Floats c) { return _mm256_fmadd_ps(a, b, c); }
+inline Floats fnma(Floats a, Floats b, Floats c) { return _mm256_fnmadd_ps(a, b, c); }
 inline Floats maximum(Floats a, Floats b) { return _mm256_max_ps(a, b); }
 inline Floats minimum(Floats a, Floats b) { return _mm256_min_ps(a, b); }
 inline Floats square_root(Floats a) { return _mm256_sqrt_ps(a); }
+inline Floats magnitude(Floats a) { return _mm256_andnot_ps(_mm256_set1_ps(-0.0f), a); }
+inline Floats negative(Floats a) { return _mm256_or_ps(_mm256_set1_ps(-0.0f), a); }
 inline Floats round(Floats a) { return _mm256_round_ps(a, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC); }
 // In two halves, so that denormal results come out right.
 inline Floats scale_by_power(Floats a, Floats n) {
@@ -176,6 +188,10 @@ inline Floats scale_by_power(Floats a, Floats n) {
     const __m256i rest = _mm256_sub_epi32(whole, half);
     a *= _mm256_castsi256_ps(_mm256_slli_epi32(_mm256_add_epi32(half, bias), 23));
     return a * _mm256_castsi256_ps(_mm256_slli_epi32(_mm256_add_epi32(rest, bias), 23));
+}
+
+inline Floats gather(const float *p, const int32_t *offsets) {
+    return _mm256_i32gather_ps(p, _mm256_loadu_si256(reinterpret_cast<const __m256i *>(offsets)), 4);
 }
 
 inline Floats rotate(Floats a, int distance) {
@@ -295,6 +311,7 @@ inline void stream(float *p, Floats a) { store(p, a); }
 inline Floats load_first(const float *p, int n) { return each([&](int i) { return i < n ? p[i] : 0.0f; }); }
 inline void store_first(float *p, Floats a, int n) { std::memcpy(p, a.lane, n * sizeof(float)); }
 inline Floats fma(Floats a, Floats b, Floats c) { return a * b + c; }
+inline Floats fnma(Floats a, Floats b, Floats c) { return c - a * b; }
 inline Floats maximum(Floats a, Floats b) {
     return each([&](int i) { return a.lane[i] > b.lane[i] ? a.lane[i] : b.lane[i]; });
 }
@@ -302,6 +319,8 @@ inline Floats minimum(Floats a, Floats b) {
     return each([&](int i) { return a.lane[i] < b.lane[i] ? a.lane[i] : b.lane[i]; });
 }
 inline Floats square_root(Floats a) { return each([&](int i) { return std::sqrt(a.lane[i]); }); }
+inline Floats magnitude(Floats a) { return each([&](int i) { return std::fabs(a.lane[i]); }); }
+inline Floats negative(Floats a) { return each([&](int i) { return -std::fabs(a.lane[i]); }); }
 inline Floats round(Floats a) { return each([&](int i) { return std::nearbyint(a.lane[i]); }); }
 inline float power_of_two(int n) {
     const uint32_t bits = uint32_t(n + 127) << 23;
@@ -315,6 +334,7 @@ inline Floats scale_by_power(Floats a, Floats n) {
         return a.lane[i] * power_of_two(half) * power_of_two(whole - half);
     });
 }
+inline Floats gather(const float *p, const int32_t *offsets) { return each([&](int i) { return p[offsets[i]]; }); }
 inline Floats rotate(Floats a, int distance) { return each([&](int i) { return a.lane[(i + distance) % LANES]; }); }
 inline Floats sums(const Floats (&rows)[LANES]) {
     return each([&](int i) {

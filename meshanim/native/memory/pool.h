@@ -2,8 +2,10 @@
 //
 // malloc returns large blocks to the kernel when they are freed, which then clears every page again at the next use:
 // of a training step on a large mesh that was more than half the time. Here a freed block stays mapped, and the
-// kernel may take its pages back when memory runs short (MADV_FREE). Blocks in use and idle together never exceed
-// the most that was in use at once.
+// kernel may take a large one's pages back when memory runs short (MADV_FREE; for a small one, to say so costs more
+// time than its pages are worth). Blocks in use and idle together never exceed
+// 5 / 4 of the most that was in use at once: a step's phases want blocks of different sizes, and without that room
+// each would drop what the next one needs.
 #pragma once
 #include <algorithm>
 #include <cstddef>
@@ -20,6 +22,7 @@
 namespace memory {
 
 constexpr size_t ALIGNMENT = 64, GRAIN = 1 << 21;  // bytes; a huge page
+constexpr size_t LARGE = 1 << 26;
 
 struct Block {
     void *data;
@@ -53,7 +56,7 @@ inline void unmap(const Block &block) {
 
 inline void let_reclaim(const Block &block) {
 #ifdef MADV_FREE
-    madvise(block.data, block.size, MADV_FREE);
+    if (block.size >= LARGE) madvise(block.data, block.size, MADV_FREE);
 #else
     (void)block;
 #endif
@@ -98,7 +101,7 @@ class Pool {
 
    private:
     void trim() {  // the longest idle first
-        while (!idle_.empty() && used_bytes_ + idle_bytes_ > most_used_) {
+        while (!idle_.empty() && used_bytes_ + idle_bytes_ > most_used_ + most_used_ / 4) {
             unmap(idle_.front());
             idle_bytes_ -= idle_.front().size;
             idle_.pop_front();

@@ -69,24 +69,6 @@ class Arena {
     std::unique_ptr<memory::Lease> lease_;
 };
 
-struct State {
-    static constexpr uint32_t MAGIC = 0x53504c54;
-    float token = 0;   // first: what the tensor shows
-    uint32_t magic = MAGIC;
-    int64_t items = 0, tiles = 0, entries = 0, longest = 0;
-    float *records = nullptr;
-    splat::Bins bins{};
-    uint64_t *masks = nullptr;
-    int32_t *used = nullptr;
-    Arena of_items, of_entries;
-};
-
-const State &state_of(const Token &token) {
-    const State &state = *reinterpret_cast<const State *>(token.data());
-    require(state.magic == State::MAGIC, "splat: this is not a state");
-    return state;
-}
-
 struct SceneArrays {
     Rows<3> means;
     Rows<4> quaternions;
@@ -104,7 +86,6 @@ template <class Array> splat::Field field(const Array &array, const Scene &scene
     return {array.data(), array.shape(0) == 1 ? 0 : width * scene.gaussians};
 }
 
-// What stays the same from forward to backward; made once in Python.
 struct SceneHandle {
     Scene scene;
     SceneArrays arrays;
@@ -132,6 +113,27 @@ struct SceneHandle {
                 "splat: too many Gaussians times images, or too large an image; render fewer images at once");
     }
 };
+
+struct State {
+    static constexpr uint32_t MAGIC = 0x53504c54;
+    float token = 0;   // first: what the tensor shows
+    uint32_t magic = MAGIC;
+    int64_t items = 0, tiles = 0, entries = 0, longest = 0;
+    float *records = nullptr;
+    splat::Bins bins{};
+    uint64_t *masks = nullptr;
+    int32_t *used = nullptr;
+    Arena of_items, of_entries;
+    SceneHandle handle;
+
+    explicit State(const SceneHandle &scene) : handle(scene) {}
+};
+
+const State &state_of(const Token &token) {
+    const State &state = *reinterpret_cast<const State *>(token.data());
+    require(state.magic == State::MAGIC, "splat: this is not a state");
+    return state;
+}
 
 // Exclusive prefix sum in place; returns the total.
 int64_t accumulate(int64_t *counts, int64_t size) {
@@ -198,7 +200,7 @@ nb::tuple forward(const SceneHandle &handle) {
     const int64_t planes_size = scene.images() * (scene.blended() + 1) * scene.height * scene.width;
     auto planes = std::make_unique<memory::Lease>(sizeof(float) * size_t(planes_size));
     auto radii = std::make_unique<memory::Lease>(sizeof(int32_t) * size_t(scene.items() * 2));
-    auto state = std::make_unique<State>();
+    auto state = std::make_unique<State>(handle);
     bool finite;
     {
         nb::gil_scoped_release release;
@@ -219,11 +221,11 @@ float *data_of(const Target &target, int64_t size) {
     return target->data();
 }
 
-void backward(const SceneHandle &handle, Token token, Gradient<4> rgb, Gradient<3> alpha, Gradient<3> depth, Target means,
+void backward(Token token, Gradient<4> rgb, Gradient<3> alpha, Gradient<3> depth, Target means,
               Target quaternions, Target scales, Target opacities, Target colors, Target offsets, Target background, Target poses) {
-    const Scene &scene = handle.scene;
     const State &state = state_of(token);
-    require(state.items == scene.items() && state.tiles == scene.tiles(), "splat: this is not the state of that scene");
+    const SceneHandle &handle = state.handle;
+    const Scene &scene = handle.scene;
     auto fits = [&](const auto &gradient) {
         return !gradient || (int64_t(gradient->shape(0)) == scene.images() && int64_t(gradient->shape(1)) == scene.height &&
                              int64_t(gradient->shape(2)) == scene.width);
@@ -309,7 +311,7 @@ void bind_splat(nb::module_ &m) {
         std::vector<float> sums(size_t(std::max(threads, 1)));
         return MESHANIM_DISPATCH(fused_multiply_adds, rounds, std::max(threads, 1), sums.data());
     }, "rounds"_a, "threads"_a, "Keep the processor busy in registers; returns the operations done, to be timed.");
-    m.def("splat_backward", &backward, "scene"_a, "state"_a.noconvert(), "rgb"_a.none(), "alpha"_a.none(), "depth"_a.none(),
+    m.def("splat_backward", &backward, "state"_a.noconvert(), "rgb"_a.none(), "alpha"_a.none(), "depth"_a.none(),
           "means"_a.none(), "quaternions"_a.none(), "scales"_a.none(), "opacities"_a.none(), "colors"_a.none(), "offsets"_a.none(),
           "background"_a.none(), "poses"_a.none(), "Gradients of the images to those of the parameters, written into what is given.");
 }

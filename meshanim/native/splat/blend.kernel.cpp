@@ -14,36 +14,28 @@ using splat::Scene;
 
 constexpr int BATCH = 128;   // entries that are listed at once
 
-// What has been blended into a block so far.
+// What has been blended into a block so far. The light of a pixel that takes no more is kept with the other sign.
 template <int CHANNELS>
 struct State {
     Floats light[BLOCKS], color[CHANNELS][BLOCKS];
-    Mask open[BLOCKS];   // pixels that still take something
 };
 
 template <int CHANNELS>
 void blend_block(const Block &block, int index, const float *local, const int32_t *list, int count, float max_alpha,
                  State<CHANNELS> &state) {
-    const Floats u = block.u, v = block.v, least = broadcast(splat::LOG2_MIN_ALPHA), most = broadcast(max_alpha), end = broadcast(splat::MIN_LIGHT);
+    const Floats u = block.u, v = block.v, most = broadcast(max_alpha), end = broadcast(splat::MIN_LIGHT);
     Floats light = state.light[index], color[CHANNELS];
     for (int j = 0; j < CHANNELS; ++j) color[j] = state.color[j][index];
-    Mask open = state.open[index];
     for (int i = 0; i < count; ++i) {
         const float *e = local + list[i];
-        const Floats p = fma(broadcast(e[splat::A]), u, fma(broadcast(e[splat::B]), v, broadcast(e[P])));
-        const Floats q = fma(broadcast(e[splat::C]), v, broadcast(e[Q]));
-        const Floats level = broadcast(e[splat::LEVEL]) - q * q - p * p;
-        const Mask counts = simd::both(open, simd::at_least(level, least));
-        const Floats alpha = simd::minimum(simd::exp2(level), most), left = light - light * alpha;
-        const Mask taken = simd::both(counts, simd::greater(left, end));
-        open = simd::without(open, simd::without(counts, taken));
-        const Floats weight = simd::keep(taken, alpha * light);
+        const Floats alpha = simd::minimum(visible_alpha(e, u, v), most), left = simd::fnma(light, alpha, light);
+        const Mask taken = simd::greater(left, end);
+        const Floats weight = simd::keep(taken, light - left);
         for (int j = 0; j < CHANNELS; ++j) color[j] = fma(weight, broadcast(e[splat::COLOR + j]), color[j]);
-        light = simd::select(taken, left, light);
+        light = simd::select(taken, left, simd::negative(light));
     }
     state.light[index] = light;
     for (int j = 0; j < CHANNELS; ++j) state.color[j][index] = color[j];
-    state.open[index] = open;
 }
 
 // A plane of a tile from its blocks, a vector of a row of pixels at a time.
@@ -74,10 +66,10 @@ void write_tile(const Scene &scene, const Tile &tile, int group, const State<CHA
     for (int j = 0; j < CHANNELS; ++j) {
         const int64_t channel = int64_t(group) * splat::GROUP + j;
         const Floats behind = broadcast(channel < scene.channels ? scene.background[tile.image * scene.channels + channel] : 0.0f);
-        write_plane(scene, tile, image + channel * area, [&](int b) { return fma(state.light[b], behind, state.color[j][b]); });
+        write_plane(scene, tile, image + channel * area, [&](int b) { return fma(simd::magnitude(state.light[b]), behind, state.color[j][b]); });
     }
     if (group == 0)
-        write_plane(scene, tile, image + scene.blended() * area, [&](int b) { return broadcast(1.0f) - state.light[b]; });
+        write_plane(scene, tile, image + scene.blended() * area, [&](int b) { return broadcast(1.0f) - simd::magnitude(state.light[b]); });
 }
 
 template <int CHANNELS>
@@ -87,11 +79,10 @@ void blend_tile(const Scene &scene, const Forward &out, int64_t index, int group
     State<CHANNELS> state;
     bool open[BLOCKS];
     for (int b = 0; b < BLOCKS; ++b) {
-        state.light[b] = broadcast(1.0f);
+        const Floats one = broadcast(1.0f);
         for (int j = 0; j < CHANNELS; ++j) state.color[j][b] = broadcast(0.0f);
-        if (begin == end) continue;
-        state.open[b] = block_at(b).inside(tile);
-        open[b] = simd::any(state.open[b]);
+        state.light[b] = simd::select(block_at(b).inside(tile), one, simd::negative(one));
+        open[b] = simd::any(simd::greater(state.light[b], broadcast(0.0f)));
     }
     alignas(64) float local[BATCH * RECORD];
     int32_t lists[BLOCKS * (BATCH + LANES)], counts[BLOCKS];
@@ -108,7 +99,7 @@ void blend_tile(const Scene &scene, const Forward &out, int64_t index, int group
             if (!open[b]) continue;
             if (counts[b]) {
                 blend_block<CHANNELS>(block_at(b), b, local, lists + b * (BATCH + LANES), counts[b], scene.max_alpha, state);
-                open[b] = simd::any(state.open[b]);
+                open[b] = simd::any(simd::greater(state.light[b], broadcast(0.0f)));
             }
             any = any || open[b];
         }

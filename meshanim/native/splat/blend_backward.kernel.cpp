@@ -44,21 +44,29 @@ struct Scratch {
     }
 };
 
-Floats load_gradient(const ImageGradient &gradient, const Tile &tile, const Block &block, int64_t channel) {
-    if (!gradient.data) return broadcast(0.0f);
-    const float *corner = gradient.data + tile.image * gradient.image + (tile.y + block.row) * gradient.y +
-                          (tile.x + block.column) * gradient.x + channel * gradient.channel;
-    float lanes[LANES] = {};
-    if (tile.whole() && gradient.x == 1) {
-        for (int row = 0; row < BLOCK_HEIGHT; ++row) std::memcpy(lanes + row * BLOCK_WIDTH, corner + row * gradient.y, BLOCK_WIDTH * sizeof(float));
+// Gradients of an image at the pixels of a tile's blocks; zero outside the image.
+class PixelGradient {
+   public:
+    PixelGradient(const ImageGradient &gradient, const Tile &tile) : gradient_(gradient), tile_(tile) {
+        for (int l = 0; l < LANES; ++l) offsets_[l] = int32_t(l / BLOCK_WIDTH * gradient.y + l % BLOCK_WIDTH * gradient.x);
+        corner_ = gradient.data ? gradient.data + tile.image * gradient.image + tile.y * gradient.y + tile.x * gradient.x : nullptr;
+    }
+    Floats at(const Block &block, int64_t channel) const {
+        if (!corner_) return broadcast(0.0f);
+        const float *corner = corner_ + block.row * gradient_.y + block.column * gradient_.x + channel * gradient_.channel;
+        if (block.row + BLOCK_HEIGHT <= tile_.height && block.column + BLOCK_WIDTH <= tile_.width) return simd::gather(corner, offsets_);
+        float lanes[LANES] = {};
+        for (int l = 0; l < LANES; ++l)
+            if (block.row + l / BLOCK_WIDTH < tile_.height && block.column + l % BLOCK_WIDTH < tile_.width) lanes[l] = corner[offsets_[l]];
         return simd::load(lanes);
     }
-    for (int l = 0; l < LANES; ++l) {
-        const int row = l / BLOCK_WIDTH, column = l % BLOCK_WIDTH;
-        if (block.row + row < tile.height && block.column + column < tile.width) lanes[l] = corner[row * gradient.y + column * gradient.x];
-    }
-    return simd::load(lanes);
-}
+
+   private:
+    const ImageGradient &gradient_;
+    const Tile &tile_;
+    const float *corner_;
+    int32_t offsets_[LANES];
+};
 
 // The polynomials in (u, v) that the moments are sums of, by quads: weights[vector][row of the block] for pixels.
 struct Basis {
@@ -82,7 +90,8 @@ class TileGradient {
    public:
     TileGradient(const Scene &scene, const Backward &in, int64_t index, float *memory)
         : scene_(scene), in_(in), index_(index), tile_(scene, index), begin_(in.bins.tiles[index]),
-          count_(in.used[index]), scratch_(memory, count_) {}
+          count_(in.used[index]), scratch_(memory, count_),
+          rgb_(in.rgb, tile_), alpha_(in.alpha, tile_), depths_(in.depths, tile_) {}
 
     void run() {
         const int64_t total = in_.bins.tiles[index_ + 1] - begin_;
@@ -112,11 +121,11 @@ class TileGradient {
         const Block &block = block_at(index);
         if (block.row >= tile_.height || block.column >= tile_.width || (count == 0 && !in_.background)) return;
         Floats gradient[CHANNELS];
-        Floats behind = in_.group == 0 ? broadcast(0.0f) - load_gradient(in_.alpha, tile_, block, 0) : broadcast(0.0f);
+        Floats behind = in_.group == 0 ? broadcast(0.0f) - alpha_.at(block, 0) : broadcast(0.0f);
         for (int j = 0; j < CHANNELS; ++j) {
             const int64_t channel = int64_t(in_.group) * splat::GROUP + j;
             const bool color = channel < scene_.channels;
-            gradient[j] = load_gradient(color ? in_.rgb : in_.depths, tile_, block, color ? channel : 0);
+            gradient[j] = color ? rgb_.at(block, channel) : depths_.at(block, 0);
             if (color) behind = fma(gradient[j], broadcast(scene_.background[tile_.image * scene_.channels + channel]), behind);
         }
         const int32_t *list = scratch_.lists + index * scratch_.stride;
@@ -127,25 +136,18 @@ class TileGradient {
 
     // Keeps (alpha, weight) of each pair, zero where nothing was blended; cuts the list where no pixel takes more.
     Floats near_to_far(const Block &block, const int32_t *list, int &count) {
-        const Floats u = block.u, v = block.v, least = broadcast(splat::LOG2_MIN_ALPHA), most = broadcast(scene_.max_alpha), end = broadcast(splat::MIN_LIGHT);
-        Floats light = broadcast(1.0f);
-        Mask open = block.inside(tile_);
+        const Floats u = block.u, v = block.v, most = broadcast(scene_.max_alpha), end = broadcast(splat::MIN_LIGHT), one = broadcast(1.0f);
+        Floats light = simd::select(block.inside(tile_), one, simd::negative(one));
         float *pair = scratch_.pairs;
         for (int i = 0; i < count; ++i, pair += 2 * LANES) {
-            const float *e = scratch_.local + list[i];
-            const Floats p = fma(broadcast(e[splat::A]), u, fma(broadcast(e[splat::B]), v, broadcast(e[P])));
-            const Floats q = fma(broadcast(e[splat::C]), v, broadcast(e[Q]));
-            const Floats level = broadcast(e[splat::LEVEL]) - q * q - p * p;
-            const Mask counts = simd::both(open, simd::at_least(level, least));
-            const Floats alpha = simd::minimum(simd::exp2(level), most), left = light - light * alpha;
-            const Mask taken = simd::both(counts, simd::greater(left, end));
-            open = simd::without(open, simd::without(counts, taken));
+            const Floats alpha = simd::minimum(visible_alpha(scratch_.local + list[i], u, v), most), left = simd::fnma(light, alpha, light);
+            const Mask taken = simd::greater(left, end);
             simd::store(pair, simd::keep(taken, alpha));
             simd::store(pair + LANES, simd::keep(taken, alpha * light));
-            light = simd::select(taken, left, light);
-            if (i % 16 == 15 && !simd::any(open)) count = i + 1;
+            light = simd::select(taken, left, simd::negative(light));
+            if (i % 16 == 15 && !simd::any(simd::greater(light, broadcast(0.0f)))) count = i + 1;
         }
-        return light;
+        return simd::magnitude(light);
     }
 
     // d L / d ln alpha of every pixel, zero where max_alpha acts, and at once its sums and those of the colours.
@@ -230,6 +232,7 @@ class TileGradient {
     Tile tile_;
     int64_t begin_, count_;
     Scratch scratch_;
+    PixelGradient rgb_, alpha_, depths_;
 };
 
 }  // namespace

@@ -77,6 +77,14 @@ inline const Block &block_at(int index) {
     return all.blocks[index];
 }
 
+// Alphas of an entry at a block's pixels, before max_alpha; 0 where they are less than MIN_ALPHA.
+inline Floats visible_alpha(const float *local, Floats u, Floats v) {
+    const Floats p = fma(broadcast(local[splat::A]), u, fma(broadcast(local[splat::B]), v, broadcast(local[P])));
+    const Floats q = fma(broadcast(local[splat::C]), v, broadcast(local[Q]));
+    const Floats level = broadcast(local[splat::LEVEL]) - q * q - p * p;
+    return simd::keep(simd::at_least(level, broadcast(splat::LOG2_MIN_ALPHA)), simd::exp2(level));
+}
+
 // Copies LANES records and returns the first FIELDS, a vector each.
 inline void copy_records(const float *const (&rows)[LANES], float *out, Floats (&fields)[FIELDS]) {
     for (int part = 0; part < RECORD; part += LANES) {
