@@ -6,6 +6,7 @@
 #include <nanobind/stl/optional.h>
 
 #include <algorithm>
+#include <cmath>
 #include <cstring>
 #include <limits>
 #include <memory>
@@ -108,6 +109,7 @@ struct SceneHandle {
         scene.opacities = field(opacities, scene, 1), scene.colors = field(colors, scene, int64_t(colors.shape(2)));
         scene.poses = poses.data(), scene.intrinsics = intrinsics.data(), scene.background = background.data();
         scene.near = near, scene.far = far, scene.eps2d = eps2d, scene.max_alpha = max_alpha;
+        scene.safe_level = std::log2(max_alpha) - 1e-5f;
         scene.antialiased = antialiased, scene.depth = depth, scene.threads = threads;
         require(scene.items() < int64_t(std::numeric_limits<int32_t>::max()) && scene.columns() < 65536 && scene.rows() < 65536,
                 "splat: too many Gaussians times images, or too large an image; render fewer images at once");

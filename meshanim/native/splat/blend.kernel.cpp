@@ -20,7 +20,7 @@ struct State {
     Floats light[BLOCKS], color[CHANNELS][BLOCKS];
 };
 
-template <int CHANNELS>
+template <int CHANNELS, bool CAPPED>
 void blend_block(const Block &block, int index, const float *local, const int32_t *list, int count, float max_alpha,
                  State<CHANNELS> &state) {
     const Floats u = block.u, v = block.v, most = broadcast(max_alpha), end = broadcast(splat::MIN_LIGHT);
@@ -28,7 +28,7 @@ void blend_block(const Block &block, int index, const float *local, const int32_
     for (int j = 0; j < CHANNELS; ++j) color[j] = state.color[j][index];
     for (int i = 0; i < count; ++i) {
         const float *e = local + list[i];
-        const Floats alpha = simd::minimum(visible_alpha(e, u, v), most), left = simd::fnma(light, alpha, light);
+        const Floats alpha = visible_alpha<CAPPED>(e, u, v, most), left = simd::fnma(light, alpha, light);
         const Mask taken = simd::greater(left, end);
         const Floats weight = simd::keep(taken, light - left);
         for (int j = 0; j < CHANNELS; ++j) color[j] = fma(weight, broadcast(e[splat::COLOR + j]), color[j]);
@@ -91,14 +91,15 @@ void blend_tile(const Scene &scene, const Forward &out, int64_t index, int group
     for (; first < end && any; first += BATCH) {
         const int count = int(end - first < BATCH ? end - first : BATCH);
         uint64_t masks[BATCH];
-        load_entries<true>(scene, tile, out.records, out.bins.entries + first, count, out.bins.count - first, group, local, masks, nullptr);
+        const bool capped = load_entries<true>(scene, tile, out.records, out.bins.entries + first, count, out.bins.count - first, group, local, masks, nullptr);
         if (group == 0) std::memcpy(out.masks + first, masks, sizeof(uint64_t) * size_t(count));
         list_blocks(masks, count, lists, BATCH + LANES, counts);
         any = false;
         for (int b = 0; b < BLOCKS; ++b) {
             if (!open[b]) continue;
             if (counts[b]) {
-                blend_block<CHANNELS>(block_at(b), b, local, lists + b * (BATCH + LANES), counts[b], scene.max_alpha, state);
+                const auto blend = capped ? blend_block<CHANNELS, true> : blend_block<CHANNELS, false>;
+                blend(block_at(b), b, local, lists + b * (BATCH + LANES), counts[b], scene.max_alpha, state);
                 open[b] = simd::any(simd::greater(state.light[b], broadcast(0.0f)));
             }
             any = any || open[b];

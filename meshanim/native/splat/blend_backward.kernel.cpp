@@ -98,12 +98,12 @@ class TileGradient {
         for (int64_t i = count_; i < total; ++i) std::memset(slot(i), 0, WIDTH * sizeof(float));
         Floats through[CHANNELS];
         for (int j = 0; j < CHANNELS; ++j) through[j] = broadcast(0.0f);
-        load_entries<false>(scene_, tile_, in_.records, in_.bins.entries + begin_, count_, in_.bins.count - begin_, in_.group, scratch_.local, nullptr,
+        const bool capped = load_entries<false>(scene_, tile_, in_.records, in_.bins.entries + begin_, count_, in_.bins.count - begin_, in_.group, scratch_.local, nullptr,
                             scratch_.shapes);
         std::memset(scratch_.sums, 0, sizeof(float) * size_t(count_ * VECTORS<CHANNELS> * LANES));
         int32_t counts[BLOCKS];
         list_blocks(in_.masks + begin_, int(count_), scratch_.lists, scratch_.stride, counts);
-        for (int b = 0; b < BLOCKS; ++b) block(b, counts[b], through);
+        for (int b = 0; b < BLOCKS; ++b) capped ? block<true>(b, counts[b], through) : block<false>(b, counts[b], through);
         for (int64_t first = 0; first < count_; first += LANES) finish(first);
         for (int j = 0; j < CHANNELS; ++j) {
             const int64_t channel = int64_t(in_.group) * splat::GROUP + j;
@@ -117,6 +117,7 @@ class TileGradient {
 
     float *slot(int64_t i) const { return in_.slots + int64_t(in_.bins.entries[begin_ + i].slot) * WIDTH; }
 
+    template <bool CAPPED>
     void block(int index, int count, Floats (&through)[CHANNELS]) {
         const Block &block = block_at(index);
         if (block.row >= tile_.height || block.column >= tile_.width || (count == 0 && !in_.background)) return;
@@ -129,18 +130,19 @@ class TileGradient {
             if (color) behind = fma(gradient[j], broadcast(scene_.background[tile_.image * scene_.channels + channel]), behind);
         }
         const int32_t *list = scratch_.lists + index * scratch_.stride;
-        const Floats light = near_to_far(block, list, count);
+        const Floats light = near_to_far<CAPPED>(block, list, count);
         for (int j = 0; j < CHANNELS; ++j) through[j] = fma(gradient[j], light, through[j]);
-        far_to_near(index, list, count, gradient, behind);
+        far_to_near<CAPPED>(index, list, count, gradient, behind);
     }
 
     // Keeps (alpha, weight) of each pair, zero where nothing was blended; cuts the list where no pixel takes more.
+    template <bool CAPPED>
     Floats near_to_far(const Block &block, const int32_t *list, int &count) {
         const Floats u = block.u, v = block.v, most = broadcast(scene_.max_alpha), end = broadcast(splat::MIN_LIGHT), one = broadcast(1.0f);
         Floats light = simd::select(block.inside(tile_), one, simd::negative(one));
         float *pair = scratch_.pairs;
         for (int i = 0; i < count; ++i, pair += 2 * LANES) {
-            const Floats alpha = simd::minimum(visible_alpha(scratch_.local + list[i], u, v), most), left = simd::fnma(light, alpha, light);
+            const Floats alpha = visible_alpha<CAPPED>(scratch_.local + list[i], u, v, most), left = simd::fnma(light, alpha, light);
             const Mask taken = simd::greater(left, end);
             simd::store(pair, simd::keep(taken, alpha));
             simd::store(pair + LANES, simd::keep(taken, alpha * light));
@@ -151,6 +153,7 @@ class TileGradient {
     }
 
     // d L / d ln alpha of every pixel, zero where max_alpha acts, and at once its sums and those of the colours.
+    template <bool CAPPED>
     void far_to_near(int index, const int32_t *list, int count, const Floats (&gradient)[CHANNELS], Floats behind) {
         static const Basis basis;
         Floats shape[MOMENT_VECTORS][QUADS], paint[COLOR_VECTORS][QUADS];
@@ -168,7 +171,7 @@ class TileGradient {
             const Floats alpha = simd::load(pair), weight = simd::load(pair + LANES), rise = color - behind;
             behind = fma(alpha, rise, behind);
             Floats change[QUADS], part[QUADS];
-            simd::spread_quads(simd::keep(simd::greater(most, alpha), weight * rise), change);
+            simd::spread_quads(CAPPED ? simd::keep(simd::greater(most, alpha), weight * rise) : weight * rise, change);
             for (int row = 0; row < QUADS; ++row) part[row] = simd::load_quad(pair + LANES + 4 * row);
             float *const sums = scratch_.sums + int64_t(list[i]) / RECORD * (VECTORS<CHANNELS> * LANES);
             for (int m = 0; m < MOMENT_VECTORS; ++m) {

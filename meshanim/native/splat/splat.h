@@ -40,6 +40,7 @@ struct Scene {
     Field means, quaternions, scales, opacities, colors;
     const float *poses, *intrinsics, *background;   // (images, 4, 4), (images, 3, 3), (images, channels)
     float near, far, eps2d, max_alpha;
+    float safe_level;                     // log2 of opacities that max_alpha surely leaves alone
     bool antialiased, depth;              // depth: one more channel
     int threads;
 

@@ -77,12 +77,14 @@ inline const Block &block_at(int index) {
     return all.blocks[index];
 }
 
-// Alphas of an entry at a block's pixels, before max_alpha; 0 where they are less than MIN_ALPHA.
-inline Floats visible_alpha(const float *local, Floats u, Floats v) {
+// Alphas of an entry at a block's pixels; 0 where they are less than MIN_ALPHA. CAPPED: max_alpha may act.
+template <bool CAPPED>
+inline Floats visible_alpha(const float *local, Floats u, Floats v, Floats max_alpha) {
     const Floats p = fma(broadcast(local[splat::A]), u, fma(broadcast(local[splat::B]), v, broadcast(local[P])));
     const Floats q = fma(broadcast(local[splat::C]), v, broadcast(local[Q]));
     const Floats level = broadcast(local[splat::LEVEL]) - q * q - p * p;
-    return simd::keep(simd::at_least(level, broadcast(splat::LOG2_MIN_ALPHA)), simd::exp2(level));
+    const Floats alpha = simd::keep(simd::at_least(level, broadcast(splat::LOG2_MIN_ALPHA)), simd::exp2(level));
+    return CAPPED ? simd::minimum(alpha, max_alpha) : alpha;
 }
 
 // Copies LANES records and returns the first FIELDS, a vector each.
@@ -142,11 +144,12 @@ inline void block_masks(const Tile &tile, const Floats (&f)[FIELDS], uint64_t *m
 
 // Copies a tile's entries to local records, the colours of `group` among them. Finds their masks, or keeps their
 // shapes by vectors, SHAPE of them for LANES entries. All have room for a multiple of LANES. `ahead`: entries there
-// are from the first on, other tiles' included.
+// are from the first on, other tiles' included. Returns whether max_alpha may act on one.
 template <bool MASKS>
-inline void load_entries(const splat::Scene &scene, const Tile &tile, const float *records, const splat::Entry *entries,
+inline bool load_entries(const splat::Scene &scene, const Tile &tile, const float *records, const splat::Entry *entries,
                          int64_t count, int64_t ahead, int group, float *local, uint64_t *masks, float *shapes) {
     const int64_t frame = tile.image / scene.cameras, base = tile.image * scene.gaussians;
+    Floats highest = broadcast(scene.safe_level);
     for (int64_t first = 0; first < count; first += LANES) {
         const float *rows[LANES];
         for (int l = 0; l < LANES; ++l) {
@@ -160,6 +163,7 @@ inline void load_entries(const splat::Scene &scene, const Tile &tile, const floa
         float *const out = local + first * RECORD;
         Floats fields[FIELDS];
         copy_records(rows, out, fields);
+        highest = simd::maximum(highest, fields[splat::LEVEL]);
         if (MASKS) block_masks(tile, fields, masks + first);
         const Floats dx = broadcast(tile.centre_x) - fields[splat::X], dy = broadcast(tile.centre_y) - fields[splat::Y];
         fields[P] = fma(fields[splat::A], dx, fields[splat::B] * dy), fields[Q] = fields[splat::C] * dy;
@@ -179,6 +183,7 @@ inline void load_entries(const splat::Scene &scene, const Tile &tile, const floa
             }
         }
     }
+    return simd::any(simd::greater(highest, broadcast(scene.safe_level)));
 }
 
 inline int lowest_bit(uint64_t bits) {
