@@ -61,7 +61,7 @@ class FitAvatarOptions:
     """Disturb the parameters first, as a test: rotation=0.01,translation=0.001,expression=0.03 are standard
     deviations in radians, metres and weights."""
     half: bool = False
-    """Write the avatar with floats of 16 bits: half the size, for an avatar to pass on."""
+    """Write the avatar with floats of 16 and 8 bits: a third of the size, for an avatar to pass on."""
     resume: bool = False
     """Go on from the newest checkpoint in the output folder, with the same options and capture."""
     save_every: int = 2000
