@@ -115,6 +115,7 @@ def announce(output: Path, sequence: MeshSequence) -> None:
 
 def perform(options: AnimateOptions) -> tuple["Scene", MeshSequence]:
     """What is drawn, and how it moves."""
+    track = options.performance.track  # what cannot be read is said before long loading
     animator = Animator.from_pretrained(options.model, None if options.head == "own" else options.head)
     scene = Scene(animator, options)
     if options.speech.suffix.lower() in RECORDED:
@@ -123,7 +124,7 @@ def perform(options: AnimateOptions) -> tuple["Scene", MeshSequence]:
         raise OptionError("--sound goes with motion from a .csv or .npz; a sound file is its own")
     speech = load_waveform(options.speech, rate=None)
     performance = heard_performance(animator, speech, options.performance, options.neutral)
-    if performance.track is not None:
+    if track is not None:
         stream = animator.open(speech.rate, performance, scene.template)
         if stream.without_effect:
             print(f"this head does not follow {', '.join(stream.without_effect)}", file=sys.stderr)

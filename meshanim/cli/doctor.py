@@ -25,6 +25,7 @@ OPTIONAL = [
     ("espeakng_loader", "synthetic voices of espeak-ng", "pip install 'meshanim[speech]'"),
     ("py_nanotts", "synthetic voices of Pico", "pip install 'meshanim[speech]'"),
     ("transformers", "wav2vec 2.0 and HuBERT encoders", "pip install 'meshanim[encoders]'"),
+    ("onnx", "export of Audio2Face's networks", "pip install 'meshanim[onnx]'"),
     ("triton", "mesh attention on CUDA", "comes with torch's CUDA builds"),
     ("gsplat", "Gaussian splatting on CUDA", "pip install 'meshanim[cuda]'"),
 ]

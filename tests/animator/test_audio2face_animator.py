@@ -327,7 +327,7 @@ def test_neutral_post_processing_leaves_frames_as_they_are(three, kind):
 
 
 def test_controls_move_what_they_are_named_after(three):
-    parts, waveform = head_actors().basis.parts, noise(1.0)
+    parts, waveform = head_actors().basis.parts, noise(0.2)
 
     def moved(kind, **controls):
         two = (
