@@ -201,6 +201,28 @@ def test_gradients_of_any_layout(layout):
     assert torch.equal(means, again)
 
 
+def test_strided_fields_and_no_gradients_give_the_same_bits():
+    scene, views = plain(60, seed=9), cameras(24, 20)
+    expected = rasterize(leaves(scene), views).rgb.detach()
+    assert torch.equal(rasterize(scene, views).rgb, expected)
+    strided = scene.map(lambda field: torch.stack([field, field], -1)[..., 0])
+    assert not strided.means.is_contiguous()
+    assert torch.equal(rasterize(strided, views).rgb, expected)
+    given = strided.map(lambda field: field.detach().requires_grad_())
+    assert torch.equal(rasterize(given, views).rgb, expected)
+    with torch.no_grad():
+        assert torch.equal(rasterize(given, views).rgb, expected)
+
+
+def test_a_field_changed_before_backward_is_noticed():
+    scene, views = leaves(plain(20)), cameras(9, 9)
+    out = rasterize(scene, views)
+    with torch.no_grad():
+        scene.means.add_(1)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        out.rgb.sum().backward()
+
+
 def test_depth_without_a_gradient_costs_nothing_and_changes_nothing():
     scene, views = leaves(plain(50, seed=8, channels=4)), cameras(21, 18)
     weights = torch.rand(1, 18, 21, 4)
