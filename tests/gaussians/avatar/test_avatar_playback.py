@@ -107,16 +107,24 @@ def test_pictures_are_those_of_the_posed_head(head, avatar):
         play(avatar, sequence, still)
 
 
+def watch_colors(avatar, asked: list):
+    """Note what the colour network is driven by."""
+    harmonics = avatar.colors.harmonics
+
+    def watched(latents, drive, *more):
+        asked.append(drive)
+        return harmonics(latents, drive, *more)
+
+    avatar.colors.harmonics = watched
+
+
 def test_colours_get_the_weights_that_made_the_vertices(head, avatar):
     """With a colour network that shows jawOpen, the picture of an open jaw differs by it."""
     torch.manual_seed(0)
     colored = Avatar(AvatarConfig(latent=2), head, face=torch.arange(0, head.mesh.n_faces, 100))
     sequence = yawn(head)
     asked = []
-    harmonics = colored.colors.harmonics
-    colored.colors.harmonics = lambda latents, drive, *more: (
-        asked.append(drive) or harmonics(latents, drive, *more)
-    )
+    watch_colors(colored, asked)
     cameras = camera_path("front", avatar_template(colored), 3, 10.0, 16, 16)
     list(play(colored, sequence, cameras))
     drive = torch.cat(asked)[:, head.expression_names.index("jawOpen")]
@@ -137,7 +145,7 @@ def test_a_face_that_rests_in_an_expression_keeps_it(head, tmp_path):
     sequence = yawn(head)
     np.testing.assert_allclose(on_avatar(resting, sequence)[0], expected, atol=1e-6)
     asked = []
-    resting.colors.register_forward_hook(lambda module, inputs, output: asked.append(inputs[1]))
+    watch_colors(resting, asked)
     list(play(resting, sequence, camera_path("front", expected, 3, 10.0, 16, 16)))
     drive = torch.cat(asked)[:, [head.expression_names.index(name) for name in rest]]
     torch.testing.assert_close(drive[:2, 0], torch.full((2,), 0.4), atol=0.08, rtol=0)
