@@ -171,14 +171,14 @@ def _falling(start: float) -> Rate:
 
 
 SMALL_RATES = {
-    "means": _falling(8e-3),
-    "scales": _falling(1.7e-2),
-    "rotations": _falling(1e-2),
+    "means": _falling(3.2e-2),
+    "scales": _falling(6.8e-2),
+    "rotations": _falling(4e-2),
     "opacities": _falling(5e-2),
     "sh0": _falling(3.5e-2),
-    "sh_rest": _falling(2e-3),
-    "latents": _falling(1e-2),
-    "network": _falling(2e-3),
+    "sh_rest": _falling(8e-3),
+    "latents": _falling(4e-2),
+    "network": _falling(8e-3),
     "expression": _falling(2e-3),
     "pose": _falling(5e-4),
     "translation": _falling(5e-5),
@@ -186,7 +186,7 @@ SMALL_RATES = {
 PRESETS = {
     "paper": FitSettings(),
     "small": FitSettings(
-        iterations=5000,
+        iterations=4000,
         color=ColorSettings(sh_degree=2, sh_every=0.0, latent=8),
         density=Density(
             "top", start=0.08, stop=0.49, every=0.08, prune_opacity=0.02, reset_every=0.0, limit=21_800
