@@ -56,8 +56,9 @@ def _control(
 class PostProcessing:
     """Every control at one moment; `controls()` lists names, defaults, ranges, units and descriptions.
 
-    Defaults and ranges are those of Audio2Face-3D's SDK. Controls that it has not are `input_strength` (it
-    leaves that to the caller), `prediction_delay` and `blink_interval`; they default to no change.
+    Defaults and ranges are those of Audio2Face-3D's SDK, except that ranges of the lower teeth are what its
+    tests use and those of eyeballs and saccades are ours, for it publishes none. Controls that it has not are
+    `input_strength` (it leaves that to the caller), `prediction_delay` and `blink_interval`.
 
     Raises
     ------
