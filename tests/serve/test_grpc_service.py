@@ -291,10 +291,10 @@ def test_more_clients_than_it_takes_are_refused_and_those_that_vanish_make_room(
 
 
 def test_a_client_that_says_nothing_is_told_so(animator, speech):
-    with Served(animator, streams=1, idle=1.0) as served:
+    with Served(animator, streams=1, idle=3.0) as served:
         client = Held(served.stub, header())
         assert next(client.call).HasField("animation_data_stream_header")
-        expected = (grpc.StatusCode.DEADLINE_EXCEEDED, "nothing was sent or taken for 1 s")
+        expected = (grpc.StatusCode.DEADLINE_EXCEEDED, "nothing was sent or taken for 3 s")
         assert refused(client.call) == expected
         client.go.set()
         assert is_served(served, speech) == 15
