@@ -46,6 +46,26 @@ def network(folder):
     return SyncNet.from_pretrained(train_syncnet(options, progress=False))
 
 
+@pytest.fixture(scope="module")
+def models(folder):
+    """A regression and a diffusion network of three steps; the second's outputs follow its noise."""
+    short = TrainConfig(steps=3, log_every=1000, save_every=1000)
+    common = {"data": folder / "a2f", "encoder": "mel", "epochs": 0, "cpu": True, "train": short}
+    train_regression(
+        TrainRegressionOptions(output=folder / "regression", subject="anna", batch_pairs=4, **common),
+        progress=False,
+    )
+    train_diffusion(
+        TrainDiffusionOptions(output=folder / "diffusion", width=16, segment=(8, 16), **common),
+        progress=False,
+    )
+    noisy = Audio2FaceDiffusion.from_pretrained(folder / "diffusion" / "model")
+    for layer in noisy.outputs:
+        torch.nn.init.normal_(layer.weight, std=0.2)
+    noisy.save_pretrained(folder / "diffusion" / "model")
+    return str(folder / "regression"), str(folder / "diffusion")
+
+
 def held_out(folder, network):
     dataset = MeshanimDataset(folder / "data")
     cache = FeatureCache(folder / "features", load_encoder("mel"))
@@ -122,21 +142,11 @@ def test_expressiveness_is_one_for_the_emotion_of_training_and_none_for_a_still_
     assert neutral.values() == []
 
 
-def test_the_table_has_networks_truth_and_baselines(folder, network, capsys):
-    short = TrainConfig(steps=3, log_every=1000, save_every=1000)
-    common = {"data": folder / "a2f", "encoder": "mel", "epochs": 0, "cpu": True, "train": short}
-    train_regression(
-        TrainRegressionOptions(output=folder / "regression", subject="anna", batch_pairs=4, **common),
-        progress=False,
-    )
-    train_diffusion(
-        TrainDiffusionOptions(output=folder / "diffusion", width=16, segment=(8, 16), **common),
-        progress=False,
-    )
+def test_the_table_has_networks_truth_and_baselines(folder, network, models, capsys):
     arguments = ["evaluate", "a2f", "--data", str(folder / "data"), "--splits", "test"]
-    models = ["--models", str(folder / "regression"), str(folder / "diffusion")]
+    named = ["--models", *models]
     sync = ["--syncnet", str(folder / "run"), "--parts", str(folder / "parts.json")]
-    assert main([*arguments, *models, *sync, "--json", str(folder / "a.json")]) == 0
+    assert main([*arguments, *named, *sync, "--json", str(folder / "a.json")]) == 0
     printed = capsys.readouterr().out
     columns = ["truth", "A2F regression (regression)", "A2F diffusion (diffusion)", "template held still"]
     assert all(column in printed for column in columns)
@@ -151,7 +161,7 @@ def test_the_table_has_networks_truth_and_baselines(folder, network, capsys):
     assert {row["mask"] for row in rows} == {"mouth landmarks"}
     assert all(len(row["per_sequence"]) == 2 for row in rows)
     # The same run again, for one subject.
-    assert main([*arguments, *models[:2], "--subjects", "anna", "--json", str(folder / "b.json")]) == 0
+    assert main([*arguments, *named[:2], "--subjects", "anna", "--json", str(folder / "b.json")]) == 0
     one = Results.load(folder / "b.json")
     assert {row.metric for row in one.rows}.isdisjoint({"sync distance"})
     row = next(row for row in one.rows if row.metric == "mean vertex error")
@@ -159,22 +169,8 @@ def test_the_table_has_networks_truth_and_baselines(folder, network, capsys):
     assert row.measured.sequences == 1
 
 
-def test_the_diffusion_of_a_table_is_a_function_of_its_seed(folder, network):
-    model = folder / "diffusion" / "model"
-    noisy = Audio2FaceDiffusion.from_pretrained(model)
-    for layer in noisy.outputs:
-        torch.nn.init.normal_(layer.weight, std=0.2)
-    noisy.save_pretrained(model)
-    arguments = [
-        "evaluate",
-        "a2f",
-        "--data",
-        str(folder / "data"),
-        "--splits",
-        "test",
-        "--models",
-        str(model),
-    ]
+def test_the_diffusion_of_a_table_is_a_function_of_its_seed(folder, models):
+    arguments = ["evaluate", "a2f", "--data", str(folder / "data"), "--models", models[1]]
     values = []
     for run, seed in enumerate((0, 0, 1)):
         path = folder / f"seed{run}.json"
@@ -192,11 +188,11 @@ def test_the_diffusion_of_a_table_is_a_function_of_its_seed(folder, network):
         (["--models", "MISSING"], "MISSING"),
     ],
 )
-def test_bad_options_give_a_line(folder, network, capsys, changes, message):
+def test_bad_options_give_a_line(folder, network, models, capsys, changes, message):
     changes = [str(folder / "run") if word == "RUN" else word for word in changes]
     arguments = ["evaluate", "a2f", "--data", str(folder / "data")]
-    models = [] if "--models" in changes else ["--models", str(folder / "regression")]
-    assert main([*arguments, *models, *changes]) == 2
+    named = [] if "--models" in changes else ["--models", models[0]]
+    assert main([*arguments, *named, *changes]) == 2
     assert message in capsys.readouterr().err
 
 
