@@ -98,12 +98,12 @@ class AnimationStream:
         return self._advance(np.asarray(samples, np.float32), last=False)
 
     def feel(self, emotions: EmotionTrack) -> None:
-        """Follow other emotions from the next frame on, Audio2Face's networks only.
+        """Follow other emotions from the next frame on.
 
         Raises
         ------
         OptionError
-            If the network has one style for a speech, or the track does not fit it.
+            If the track does not fit the network.
         """
         self._performance.feel(emotions)
 

@@ -9,7 +9,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 import torch
 import tyro
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Float64
 from torch import Tensor
 from tyro.conf import arg
 
@@ -34,7 +34,15 @@ from meshanim.motion.lip_seal import LipSeal
 from meshanim.motion.post_files import load_post_settings, post_track
 from meshanim.motion.post_processing import PostProcessing, PostTrack
 
-__all__ = ["AnimationOptions", "Motion", "Network", "Performance", "emotion_track", "perform"]
+__all__ = [
+    "AnimationOptions",
+    "Motion",
+    "Network",
+    "Performance",
+    "emotion_track",
+    "perform",
+    "told_emotions",
+]
 
 Network = Gava | Audio2FaceRegression | Audio2FaceDiffusion
 
@@ -55,7 +63,7 @@ class AnimationOptions:
     intensity : float
         Of the emotion, 0 to 1.
     emotion_keys : sequence of str
-        Emotions over time, Audio2Face only: 0:joy=1 2.5:anger=0.4,fear=0.2 (seconds, strengths between which
+        Emotions over time: 0:joy=1 2.5:anger=0.4,fear=0.2 (seconds, strengths between which
         it is linear), or 0:SENTENCE; or one .yml of NVIDIA's with a list of them.
     implicit : str, optional
         CLIP or CLIP:FRAME of training whose implicit emotion is taken, Audio2Face's regression only; the mean
@@ -156,15 +164,15 @@ class Performance(ABC):
             If the stream is finished.
         """
 
+    @abstractmethod
     def feel(self, emotions: EmotionTrack) -> None:
         """Follow other emotions from the next frame on.
 
         Raises
         ------
         OptionError
-            If the network has one style for a speech, or the track does not fit it.
+            If the track does not fit the network.
         """
-        raise OptionError("GAVA has one emotion for a speech; Audio2Face's networks follow them over time")
 
 
 class GavaPerformance(Performance):
@@ -188,20 +196,32 @@ class GavaPerformance(Performance):
         template: Float[Tensor, "vertices 3"] | None,
         seal: LipSeal | None,
     ):
-        for name in ("emotion_keys", "implicit", "steps", "emotions", "noise"):
-            if getattr(options, name) not in (None, ()):
-                raise OptionError(f"GAVA knows no {name.replace('_', ' ')}; Audio2Face's networks do")
+        for name in ("implicit", "steps", "noise"):
+            if getattr(options, name) is not None:
+                raise OptionError(f"GAVA knows no {name}; Audio2Face's networks do")
+        self.model, self.subject, self.emotions = model, options.subject, emotion_track(model, options)
+        if self.emotions.strengths.shape[1] != len(told_emotions(model)):
+            raise OptionError(
+                f"the track has {self.emotions.strengths.shape[1]} emotions, the network "
+                f"{len(told_emotions(model))}"
+            )
         self.features = encoder.stream()
         self.mel = MelEncoder().stream() if model.config.pose else None
         self.frames = GavaStream(
             model,
             template=template,
-            style=model.style_of(options.subject, options.emotion, options.intensity),
+            style=self._styles,
             fps=options.fps,
             seal=None if seal is None else seal.to(model.surface.template.device),
             bilabial=None if seal is None else getattr(encoder, "bilabial", None),
         )
         self.fps, self.template = self.frames.fps, self.frames.template
+
+    def _styles(self, times: Float64[np.ndarray, " frames"]) -> Float[Tensor, "frames style"]:
+        return self.model.styles_over_time(self.subject, self.emotions.at(times))
+
+    def feel(self, emotions: EmotionTrack) -> None:
+        self.emotions = checked_track(emotions, self.emotions)
 
     def push(self, samples: Float32[np.ndarray, " samples"], frames: int | None = None) -> Motion:
         features = [self.features.push(samples)]
@@ -358,9 +378,14 @@ def checked_track(track: EmotionTrack, other: EmotionTrack) -> EmotionTrack:
     return track
 
 
-def emotion_track(
-    network: Audio2FaceRegression | Audio2FaceDiffusion, options: AnimationOptions
-) -> EmotionTrack:
+def told_emotions(network: Network) -> tuple[str, ...]:
+    """Emotions that a network is told by name, but neutral; none where it is told sentences."""
+    if isinstance(network, Audio2FaceDiffusion) and network.config.text:
+        return ()
+    return tuple(name for name in network.config.emotions if name != "neutral")
+
+
+def emotion_track(network: Network, options: AnimationOptions) -> EmotionTrack:
     """Emotions over time as options say.
 
     Raises
@@ -373,13 +398,13 @@ def emotion_track(
     if len(options.emotion_keys) == 1 and options.emotion_keys[0].endswith((".yml", ".yaml")):
         listed = load_post_settings(options.emotion_keys[0]).emotions
         felt = [(time, {name: by for name, by in named.items() if by}) for time, named in listed]
-        return EmotionTrack.of(network.config.emotions, *felt)
+        return EmotionTrack.of(told_emotions(network), *felt)
     keys = _keys(options.emotion_keys)
     if isinstance(network, Audio2FaceDiffusion) and network.config.text:
         sentences = keys or [(0.0, options.emotion)]
         said = [(time, _sentence(what, options.intensity)) for time, what in sentences]
         return text_track(load_text_encoder(network.config.text_encoder), *said)
-    emotions = network.config.emotions
+    emotions = told_emotions(network)
     if keys:
         return EmotionTrack.of(emotions, *((time, _mixture(what)) for time, what in keys))
     if not 0 <= options.intensity <= 1:

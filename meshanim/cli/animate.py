@@ -146,8 +146,7 @@ def heard_performance(
     sample = None if neutral is None else load_waveform(neutral)
     detector = EmotionDetector(load_audio2emotion(), neutral=sample)
     heard = with_heard_emotions(animator.model, speech, performance, detector)
-    what = "over time" if heard.emotions is not None else f"{heard.emotion} at {heard.intensity:.2f}"
-    print(f"emotion: {what}, heard by the default classifier (trained on synthetic voices)")
+    print("emotion: over time, heard by the default classifier (trained on synthetic voices)")
     return heard
 
 

@@ -327,6 +327,20 @@ class Gava(Checkpoint):
         number = torch.tensor([self.config.emotions.index(emotion)], device=device)
         return self.style(index, number, torch.tensor([intensity], device=device))
 
+    def styles_over_time(
+        self, subject: str | None, strengths: Float[Tensor, "frames emotions"]
+    ) -> Float[Tensor, "frames style"]:
+        """Style vectors of frames whose emotions change and mix.
+
+        Parameters
+        ----------
+        subject : str, optional
+            As `style_of`.
+        strengths : (T, E)
+            Of the checkpoint's emotions but neutral, which is the first.
+        """
+        return self.style_of(subject) + strengths.to(self.to_token.device) @ self.emotion_styles.weight[1:]
+
     def embed(self, templates: Float[Tensor, "subjects vertices 3"]) -> Float[Tensor, "subjects tokens rank"]:
         """Vertex embeddings of subjects by their templates, metres; once a subject, not once a frame.
 

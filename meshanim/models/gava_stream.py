@@ -1,12 +1,13 @@
 """GAVA frame by frame: features in, frames out once they are certain, whole files in bounded memory."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from meshanim.audio import feature_windows
@@ -16,7 +17,10 @@ from meshanim.motion.lip_seal import LipSeal, sealed_frames, sealed_steps
 if TYPE_CHECKING:
     from meshanim.models.gava import Gava
 
-__all__ = ["Frames", "GavaStream", "PoseSmoothing", "animate"]
+__all__ = ["Frames", "GavaStream", "PoseSmoothing", "StyleOverTime", "animate"]
+
+StyleOverTime = Callable[[Float64[np.ndarray, " frames"]], Float[Tensor, "frames style"]]
+"""Times, seconds, to style vectors."""
 
 
 class Frames(NamedTuple):
@@ -61,8 +65,8 @@ class GavaStream:
         In eval mode.
     template : (V, 3), optional
         The subject at rest, metres; the checkpoint's reference if not given.
-    style : (1, style), optional
-        What `Gava.style_of` gave; the mean style if not given.
+    style : (1, style) or StyleOverTime, optional
+        What `Gava.style_of` gave, or styles of frames by their times; the mean style if not given.
     fps : float, optional
         Frames a second; the checkpoint's if not given.
     smoothing : PoseSmoothing
@@ -79,7 +83,7 @@ class GavaStream:
         self,
         model: "Gava",
         template: Float[Tensor, "vertices 3"] | None = None,
-        style: Float[Tensor, "1 style"] | None = None,
+        style: Float[Tensor, "1 style"] | StyleOverTime | None = None,
         fps: float | None = None,
         smoothing: PoseSmoothing = PoseSmoothing(),
         seal: LipSeal | None = None,
@@ -170,7 +174,7 @@ class GavaStream:
             count = min(self.chunk, frames - self.computed)
             windows = [entry.windows(self.fps, count, self.computed) for entry in self.inputs]
             mel = windows[1] if len(windows) > 1 else None
-            out = self.model(windows[0], mel, self.embedding, self.style.expand(count, -1))
+            out = self.model(windows[0], mel, self.embedding, self._styles(count))
             self.waiting.append(self.template + out.displacements)
             self.poses.append(out.pose)
             if self.bilabial is not None:
@@ -182,6 +186,12 @@ class GavaStream:
             self.computed += count
             for entry in self.inputs:
                 entry.forget(self.fps, self.computed)
+
+    def _styles(self, count: int) -> Float[Tensor, "frames style"]:
+        """Of the next frames."""
+        if isinstance(self.style, Tensor):
+            return self.style.expand(count, -1)
+        return self.style((self.computed + np.arange(count) + 0.5) / self.fps)
 
     def _give(self, until: int) -> Frames:
         count = max(0, min(until, self.computed) - self.given)

@@ -4,14 +4,15 @@ The messages are those of NVIDIA's package `nvidia-audio2face-3d` (extra `serve`
 with emotions, and an end; the answer is a header, a message a frame with its weights and its share of the
 sound, an event when everything has been computed, and a status.
 
-Nothing grows with what clients send: a stream holds the sound of the frames that are still being computed,
+Nothing grows with what clients send: a stream holds the sound of the frames that are still being computed
+and the last two seconds of what emotions are heard in,
 reading stops while frames are computed or wait to be sent, and the numbers of streams, seconds and bytes a
 message are limited.
 """
 
 import asyncio
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,12 +24,13 @@ from tyro.conf import arg
 
 from meshanim.animator import AnimationOptions, Animator
 from meshanim.errors import BackendError, FileFormatError, MeshanimError, OptionError
-from meshanim.models.audio2face import Audio2FaceDiffusion, Audio2FaceRegression, EmotionTrack
-from meshanim.models.gava import Gava
+from meshanim.models.audio2emotion import EmotionDetector, load_audio2emotion
 from meshanim.motion.blendshape_csv import ARKIT_SHAPES
 from meshanim.motion.blendshape_solver import BlendshapeSolver, SolverOptions
 from meshanim.motion.post_files import controls_of, post_track
 from meshanim.motion.post_processing import PRESETS, PostTrack
+from meshanim.performance import told_emotions
+from meshanim.serve.stream_emotions import RequestError, StreamEmotions
 from meshanim.serve.weight_stream import WeightStream
 
 __all__ = ["Audio2FaceService", "ServeGrpcOptions", "serve_grpc", "start_server"]
@@ -40,10 +42,6 @@ SERVING = b"\x08\x01"
 RATES = (8000, 192_000)
 MESSAGE = 1 << 20
 """Most bytes of a message: half a minute of 16 kHz sound."""
-KEYS = 1000
-"""Most emotions that a stream keeps."""
-OTHER_NAMES = {"amazement": "surprise", "grief": "sadness"}
-"""What networks that lack one of NVIDIA's emotions are told instead."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +58,9 @@ class ServeGrpcOptions:
     post: str | None = None
     """Post-processing of clients that ask for none, as for meshanim animate; what a header says of it is
     changed from this."""
+    audio2emotion: str = "default"
+    """Classifier that hears emotions in the voice of clients whose header has emotion post-processing:
+    default (trained on synthetic voices), a folder that `meshanim train audio2emotion` wrote, or none."""
     host: str = "127.0.0.1"
     """Address to listen at; 0.0.0.0 for all of the machine's."""
     port: int = 52000
@@ -102,10 +103,6 @@ def _messages() -> tuple[Any, Any]:
     return grpc, messages_pb2
 
 
-class RequestError(MeshanimError):
-    """What a client sent cannot be animated; the message goes back with INVALID_ARGUMENT."""
-
-
 class Audio2FaceService:
     """`ProcessAudioStream` on a network, for any number of streams.
 
@@ -134,7 +131,10 @@ class Audio2FaceService:
         neutral = animator.open().mesh.vertices
         active = SolverOptions(active=self.names)
         self.solver = BlendshapeSolver.from_head(head, active, options.samples, neutral)
-        self.emotions = () if isinstance(animator.model, Gava) else told(animator.model)
+        self.emotions = told_emotions(animator.model)
+        self.detector = None
+        if self.emotions and options.audio2emotion != "none":
+            self.detector = EmotionDetector(load_audio2emotion(options.audio2emotion))
         track = None if options.post is None else post_track(options.post)
         self.controls = None if track is None else track.first
         self.active = 0
@@ -251,14 +251,14 @@ class _Stream:
         self.offset = self._by_shape(shapes.bs_weight_offsets, 0.0)
         self.clamp = shapes.enable_clamping_bs_weight
         self.unknown: set[str] = set()
+        listens = header.HasField("emotion_post_processing_params")
+        if listens and service.detector is None:
+            self.unknown.add("emotion_post_processing_params")
+        self.emotions = StreamEmotions(service.emotions, header, service.detector if listens else None)
         options = AnimationOptions(controls=self._controls(header.face_params))
         self.weights = WeightStream(service.animator, service.solver, self.rate, options)
         self.pending = bytearray()
         self.received, self.heard, self.sent, self.given = 0, 0, 0, 0
-        self.keys: list[tuple[float, dict[str, float]]] = []
-        beginning = header.emotion_params.beginning_emotion
-        if beginning:
-            self._feel([(0.0, beginning)])
 
     def _controls(self, parameters: Any) -> PostTrack | None:
         """Post-processing: the service's, with what the header says of it."""
@@ -298,29 +298,6 @@ class _Stream:
             )
         )
 
-    def _feel(self, keys: Iterable[tuple[float, Mapping[str, float]]]) -> None:
-        """Remember emotions at times; the network follows them from its next frame on."""
-        known = self.service.emotions
-        for seconds, strengths in keys:
-            if not np.isfinite(seconds) or not all(0 <= value <= 1 for value in strengths.values()):
-                raise RequestError("emotions must lie within 0 to 1, and their times be finite")
-            mixture: dict[str, float] = {}
-            for name, value in strengths.items():
-                name = name if name in known else OTHER_NAMES.get(name, name)
-                if name in known:
-                    mixture[name] = max(value, mixture.get(name, 0.0))
-                elif value > 0 and name != "neutral":
-                    self.unknown.add(name)
-            self.keys.append((seconds, mixture))
-        # Linear between two keys: of those that frames have passed, the last one is still needed.
-        self.keys.sort(key=lambda key: key[0])
-        past = [key for key in self.keys if key[0] <= self.given / self.weights.fps]
-        self.keys = [*past[-1:], *self.keys[len(past) :]]
-        if len(self.keys) > KEYS:
-            raise RequestError(f"more than {KEYS} emotions ahead of the sound")
-        if known:
-            self.weights.feel(EmotionTrack.of(known, *self.keys))
-
     def advance(self, sound: bytes, emotions: Any, last: bool) -> list[Any]:
         """Take sound and emotions; give an answer for every frame that is complete.
 
@@ -332,7 +309,8 @@ class _Stream:
             If there is more of it than the server takes.
         """
         if emotions:
-            self._feel((key.time_code, key.emotion) for key in emotions)
+            keys = ((key.time_code, key.emotion) for key in emotions)
+            self.emotions.tell(keys, self.given / self.weights.fps)
         self.pending += sound
         self.received += len(sound)
         if self.received > 2 * self.rate * self.service.options.seconds:
@@ -343,11 +321,17 @@ class _Stream:
             raise RequestError("the sound ends within a sample" if whole else "there was no sound")
         fresh = bytes(self.pending[self.heard - self.sent : whole - self.sent])
         self.heard = whole
-        weights = self.weights.push(np.frombuffer(fresh, "<i2").astype(np.float32) / 32768, last)
+        samples = np.frombuffer(fresh, "<i2").astype(np.float32) / 32768
+        self.emotions.hear(samples, last)
+        if self.service.emotions:
+            self.weights.feel(self.emotions.track)
+        weights = self.weights.push(samples, last)
         weights = weights[:, self.service.rows] * self.gain + self.offset
         if self.clamp:
             weights = weights.clip(0, 1)
-        return [self._frame(row, last and k == len(weights) - 1) for k, row in enumerate(weights)]
+        frames = [self._frame(row, last and k == len(weights) - 1) for k, row in enumerate(weights)]
+        self.emotions.forget(self.given / self.weights.fps)
+        return frames
 
     def _frame(self, weights: Float64[np.ndarray, " shapes"], last: bool) -> Any:
         """The next frame: its weights, and the sound that belongs to it; at the end all that is left."""
@@ -369,6 +353,9 @@ class _Stream:
             ),
             audio=AudioWithTimeCode(time_code=self.sent / 2 / self.rate, audio_buffer=sound),
         )
+        if self.service.emotions:
+            aggregate = self.emotions.aggregate(time_code + 0.5 / self.weights.fps)
+            frame.metadata["emotion_aggregate"].Pack(aggregate)
         self.sent += len(sound)
         return self.service.messages.A2F3DAnimationDataStream(animation_data=frame)
 
@@ -377,17 +364,11 @@ class _Stream:
         from nvidia_ace.status_pb2 import Status
 
         status = Status(code=Status.SUCCESS, message=f"{self.given} frames")
-        if self.unknown:
-            text = f"without effect here: {', '.join(sorted(self.unknown))}"
+        unknown = self.unknown | self.emotions.unknown
+        if unknown:
+            text = f"without effect here: {', '.join(sorted(unknown))}"
             status = Status(code=Status.WARNING, message=text)
         return self.service.messages.A2F3DAnimationDataStream(status=status)
-
-
-def told(network: Audio2FaceRegression | Audio2FaceDiffusion) -> tuple[str, ...]:
-    """Emotions that a network is told by name; none where it is told sentences."""
-    config = network.config
-    by_sentence = isinstance(network, Audio2FaceDiffusion) and network.config.text
-    return () if by_sentence else tuple(config.emotions)
 
 
 async def start_server(animator: Animator, options: ServeGrpcOptions) -> tuple[Any, int]:
@@ -436,6 +417,12 @@ def serve_grpc(options: ServeGrpcOptions) -> None:
         server, port = await start_server(animator, options)
         kind = "TLS" if options.tls else "plain"
         print(f"serving Audio2Face-3D gRPC at {options.host}:{port} ({kind})", flush=True)
+        if told_emotions(animator.model) and options.audio2emotion == "default":
+            print(
+                "emotions are heard, where clients ask for it, by the default classifier: trained on "
+                "synthetic voices, not validated on people (--audio2emotion none: not heard)",
+                flush=True,
+            )
         await server.wait_for_termination()
 
     asyncio.run(run())

@@ -22,6 +22,7 @@ from meshanim.heads import load_head
 from meshanim.models.audio2face import EmotionTrack, FrameNoise, animate_diffusion, animate_regression
 from meshanim.motion import MeshSequence
 from meshanim.motion.post_processing import PRESETS, PostProcessing, PostTrack
+from meshanim.performance import told_emotions
 
 STILL = {"blinks": 0.0, "gaze": 0.0, "sway": 0.0}
 MAKERS = {"regression": head_regression, "diffusion": head_diffusion}
@@ -200,11 +201,38 @@ def test_options_that_do_not_fit_are_refused(animators, kind, options, named):
 
 def test_gava_refuses_what_only_audio2face_has():
     animator = Animator.from_pretrained("default")
-    for options in ({"steps": 2}, {"implicit": "a"}, {"emotion_keys": ("0:joy",)}):
+    for options in ({"steps": 2}, {"implicit": "a"}):
         with pytest.raises(OptionError, match="GAVA"):
             animator.open(options=AnimationOptions(**options))
+    with pytest.raises(OptionError, match="2 emotions, the network 7"):
+        animator.open(options=AnimationOptions(emotions=EmotionTrack.of(("joy", "anger"))))
     with pytest.raises(ShapeError, match="7 vertices"):
         animator.open(template=np.zeros((7, 3)))
+
+
+def test_gava_follows_emotions_over_time():
+    animator, sound = Animator.from_pretrained("default"), noise(1.5)
+
+    def faces(**options):
+        return animator(sound, AnimationOptions(**STILL, seal=False, **options)).vertices
+
+    joy, neutral = faces(emotion="joy"), faces()
+    np.testing.assert_array_equal(faces(emotion_keys=("0:joy",)), joy)
+    np.testing.assert_array_equal(faces(emotion_keys=("0:neutral",)), neutral)
+    assert np.abs(joy - neutral).max() > 1e-3
+    changing = faces(emotion_keys=("0.5:neutral", "0.501:joy"))
+    # Eyes move against the head, whose pose is smoothed over nine frames.
+    np.testing.assert_allclose(changing[:11], neutral[:11], atol=1e-6)
+    np.testing.assert_allclose(changing[19:], joy[19:], atol=1e-6)
+    mixed = faces(emotion_keys=("0:joy=0.5,anger=0.5",))
+    assert min(np.abs(mixed - other).max() for other in (joy, neutral, faces(emotion="anger"))) > 1e-3
+
+    stream = animator.open(sound.rate, AnimationOptions(**STILL, seal=False))
+    before = stream.push(sound.samples[:16000]).vertices
+    stream.feel(EmotionTrack.of(told_emotions(animator.model), (0.0, {"joy": 1.0})))
+    after = np.concatenate([stream.push(sound.samples[16000:]).vertices, stream.finish().vertices])
+    np.testing.assert_allclose(before, neutral[: len(before)], atol=1e-6)
+    np.testing.assert_allclose(after[16:], joy[len(before) + 16 :], atol=1e-6)
 
 
 def test_networks_of_rigs_and_of_head_motion():

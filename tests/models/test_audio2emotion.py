@@ -21,6 +21,7 @@ from meshanim.models.audio2emotion import (
 )
 from meshanim.models.audio2emotion.detection import Timeline
 from meshanim.models.audio2emotion.features import EmotionFeatures, loudest
+from meshanim.models.audio2face import EmotionTrack
 from meshanim.motion.emotions import EMOTIONS, HEARD_EMOTIONS
 
 PLAIN = EmotionOptions(max_emotions=6, live_blend_coef=0.0, transition_smoothing=0.0, emotion_strength=1.0)
@@ -175,6 +176,45 @@ def test_each_option_by_hand():
     np.testing.assert_allclose(other, [0, 0, 0, 0.7, 0], atol=1e-7)
 
 
+def test_preferred_emotions_may_change_and_only_count_where_there_are_some():
+    rows = np.random.default_rng(1).dirichlet(np.ones(6), 40)
+    plain = EmotionPostProcessor(EmotionOptions()).push(rows)
+    wanting = EmotionOptions(enable_preferred_emotion=True)
+    np.testing.assert_array_equal(EmotionPostProcessor(wanting).push(rows), plain)
+    wishes = np.zeros((40, 10))
+    wishes[:, EMOTIONS.index("joy")] = 0.8
+    constant = EmotionOptions(enable_preferred_emotion=True, preferred={"joy": 0.8})
+    told = EmotionPostProcessor(wanting).push(rows, wishes)
+    np.testing.assert_array_equal(told, EmotionPostProcessor(constant).push(rows))
+    wishes[20:] = 0
+    later = EmotionPostProcessor(wanting).push(rows, wishes)
+    np.testing.assert_array_equal(later[:20], told[:20])
+    assert later[-1, EMOTIONS.index("joy")] < 0.1 < told[-1, EMOTIONS.index("joy")]
+    np.testing.assert_array_equal(EmotionPostProcessor(EmotionOptions()).push(rows, wishes), plain)
+    stuck = EmotionOptions(live_blend_coef=1.0, beginning={"fear": 0.5}, emotion_strength=1.0)
+    np.testing.assert_allclose(EmotionPostProcessor(stuck).push(rows)[:, EMOTIONS.index("fear")], 0.5)
+
+
+def test_streams_follow_preferred_emotions_and_tell_what_they_hear(detector, speech):
+    options = EmotionOptions(
+        enable_preferred_emotion=True, preferred_emotion_strength=1.0, emotion_strength=1.0,
+        transition_smoothing=0.0, live_blend_coef=0.0,
+    )  # fmt: skip
+    stream = EmotionStream(detector, options)
+    stream.preferred = EmotionTrack.of(EMOTIONS, (1.0, {"joy": 0.0}), (2.0, {"joy": 1.0}))
+    found, parts = [], []
+    for first in range(0, len(speech.samples), 4000):
+        parts.append(stream.push(speech.samples[first : first + 4000]))
+        found += stream.found
+    joy = np.concatenate(parts)[:, EMOTIONS.index("joy")]
+    np.testing.assert_allclose(joy, np.clip(np.arange(len(joy)) * 0.033 - 1, 0, 1), atol=1e-6)
+    expected = detect_emotions(speech, detector)
+    times = np.array([time for time, _ in found])
+    np.testing.assert_allclose(times, expected.times[: len(times)] + 0.95)
+    np.testing.assert_allclose([row for _, row in found], expected.probabilities[: len(times)])
+    assert len(times) == 6
+
+
 def test_a_neutral_sample_is_heard(network, speech):
     encoder = load_encoder("visemes:hidden")
     features = EmotionFeatures(network.config, encoder)
@@ -245,7 +285,7 @@ def test_bad_input_is_named(network, detector):
     for change, message in (
         ({"emotion_contrast": 9}, "emotion_contrast"),
         ({"max_emotions": 0}, "max_emotions"),
-        ({"live_blend_coef": 1.0}, "live_blend_coef"),
+        ({"live_blend_coef": 1.1}, "live_blend_coef"),
         ({"fixed_dt": 0}, "fixed_dt"),
         ({"correspondence": {"boredom": "joy"}}, "boredom"),
     ):

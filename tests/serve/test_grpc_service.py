@@ -1,6 +1,5 @@
 """The service as its clients see it: NVIDIA's own stubs, over a socket."""
 
-import asyncio
 import gc
 import resource
 import shutil
@@ -13,56 +12,17 @@ from importlib.resources import files
 
 import numpy as np
 import pytest
-from face_networks import head_regression
+from grpc_client import END, FPS, RATE, Answer, Served, grpc, header, messages, pcm, requests, sound
 
 from meshanim.animator import AnimationOptions, Animator
-from meshanim.audio import Waveform, load_encoder, load_waveform
+from meshanim.audio import Waveform, load_waveform
 from meshanim.cli import main
-from meshanim.heads import load_head
 from meshanim.motion.blendshape_csv import ARKIT_SHAPES
 from meshanim.motion.blendshape_solver import BlendshapeSolver, SolverOptions
 from meshanim.motion.post_processing import PRESETS, PostTrack
-from meshanim.serve.grpc_service import MESSAGE, ServeGrpcOptions, start_server
+from meshanim.serve.grpc_service import MESSAGE
 
-grpc = pytest.importorskip("grpc", reason="needs the extra `serve`")
-pytest.importorskip("nvidia_audio2face_3d", reason="needs the extra `serve`")
-from nvidia_ace.audio_pb2 import AudioHeader  # noqa: E402
-from nvidia_ace.status_pb2 import Status  # noqa: E402
-from nvidia_audio2face_3d import messages_pb2 as messages  # noqa: E402
-from nvidia_audio2face_3d.audio2face_pb2_grpc import A2FControllerServiceStub  # noqa: E402
-
-FPS, RATE = 30.0, 16000
-
-
-class Served:
-    """A server on a thread of its own, and a client's channel to it."""
-
-    def __init__(self, animator, channel=None, **options):
-        self.loop = asyncio.new_event_loop()
-        self.thread = threading.Thread(target=self.loop.run_forever, daemon=True)
-        self.thread.start()
-        chosen = ServeGrpcOptions(port=0, **options)
-        self.server, self.port = self._call(start_server(animator, chosen))
-        address = f"localhost:{self.port}"
-        credentials = channel
-        self.channel = (
-            grpc.insecure_channel(address)
-            if credentials is None
-            else grpc.secure_channel(address, credentials)
-        )
-        self.stub = A2FControllerServiceStub(self.channel)
-
-    def _call(self, coroutine):
-        return asyncio.run_coroutine_threadsafe(coroutine, self.loop).result(60)
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *error):
-        self.channel.close()
-        self._call(self.server.stop(0))
-        self.loop.call_soon_threadsafe(self.loop.stop)
-        self.thread.join(10)
+from nvidia_ace.status_pb2 import Status  # isort: skip
 
 
 @pytest.fixture(scope="module")
@@ -79,64 +39,6 @@ def served(animator):
 @pytest.fixture(scope="module")
 def speech():
     return load_waveform(files("meshanim") / "audio/clips/sense_and_sensibility.flac").resampled(RATE)
-
-
-def pcm(speech, seconds):
-    return (speech.samples[: int(seconds * RATE)].clip(-1, 1) * 32767).astype("<i2").tobytes()
-
-
-def header(channels=1, bits=16, rate=RATE, **fields):
-    sound = AudioHeader(
-        audio_format=AudioHeader.AUDIO_FORMAT_PCM,
-        channel_count=channels,
-        bits_per_sample=bits,
-        samples_per_second=rate,
-    )
-    return messages.AudioWithEmotionStream(
-        audio_stream_header=messages.AudioWithEmotionStreamHeader(audio_header=sound, **fields)
-    )
-
-
-def sound(data, emotions=()):
-    return messages.AudioWithEmotionStream(
-        audio_with_emotion=messages.AudioWithEmotion(audio_buffer=data, emotions=emotions)
-    )
-
-
-END = messages.AudioWithEmotionStream(end_of_audio=messages.AudioWithEmotionStream.EndOfAudio())
-
-
-def requests(data, size=3200, **fields):
-    yield header(**fields)
-    for first in range(0, len(data), size):
-        yield sound(data[first : first + size])
-    yield END
-
-
-class Answer:
-    """What a client makes of the answers."""
-
-    def __init__(self, answers):
-        kinds = []
-        self.weights, self.times, self.sound, self.status, self.names = [], [], b"", None, None
-        for answer in answers:
-            kinds.append(answer.WhichOneof("stream_part"))
-            if kinds[-1] == "animation_data_stream_header":
-                self.names = list(answer.animation_data_stream_header.skel_animation_header.blend_shapes)
-                self.begun = answer.animation_data_stream_header.start_time_code_since_epoch
-                self.rate = answer.animation_data_stream_header.audio_header.samples_per_second
-            elif kinds[-1] == "animation_data":
-                (frame,) = answer.animation_data.skel_animation.blend_shape_weights
-                self.times.append(frame.time_code)
-                self.weights.append(list(frame.values))
-                assert answer.animation_data.audio.time_code == pytest.approx(len(self.sound) / 2 / self.rate)
-                self.sound += answer.animation_data.audio.audio_buffer
-            elif kinds[-1] == "status":
-                self.status = answer.status
-        self.weights = np.array(self.weights)
-        self.order = [
-            kind for k, kind in enumerate(kinds) if kind != "animation_data" or kinds[k - 1] != kind
-        ]
 
 
 @pytest.fixture(scope="module")
@@ -396,27 +298,6 @@ def test_a_client_that_never_reads_is_not_read_either(animator, speech):
 def test_its_health_can_be_asked(served):
     check = served.channel.unary_unary("/grpc.health.v1.Health/Check", bytes, bytes)
     assert check(b"", timeout=10) == b"\x08\x01"
-
-
-def test_emotions_are_followed_over_time(speech):
-    animator = Animator(head_regression(), load_encoder("mel"), load_head("default"))
-
-    def run(*keys, beginning=None):
-        emotions = [messages.EmotionWithTimeCode(time_code=time, emotion=value) for time, value in keys]
-        first = header(emotion_params=messages.EmotionParameters(beginning_emotion=beginning or {}))
-        data = [first, sound(pcm(speech, 1.5), emotions), END]
-        return Answer(served.stub.ProcessAudioStream(iter(data), timeout=60))
-
-    with Served(animator) as served:
-        neutral, joyful = run(), run(beginning={"joy": 1.0})
-        assert np.abs(neutral.weights - joyful.weights).max() > 0.02
-        later = run((0.0, {"joy": 0.0}), (0.7, {"joy": 0.0}), (0.75, {"joy": 1.0}))
-        np.testing.assert_allclose(later.weights[:20], neutral.weights[:20], atol=2e-3)
-        np.testing.assert_allclose(later.weights[24:], joyful.weights[24:], atol=2e-3)
-        odd = run((0.0, {"outofbreath": 0.5, "joy": 0.0}))
-        assert odd.status.code == Status.WARNING
-        assert "without effect here: outofbreath" in odd.status.message
-        np.testing.assert_allclose(odd.weights, neutral.weights, atol=2e-3)
 
 
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="needs openssl to make a certificate")

@@ -136,6 +136,13 @@ class EmotionStream:
     options : EmotionOptions, optional
     emotions : sequence of str
         Of the face.
+
+    Attributes
+    ----------
+    preferred : EmotionTrack, optional
+        Preferred emotions over time, which frames from the next one on follow instead of the options' one.
+    found : list of (float, (6,) array)
+        Windows that the last call completed: their ends, seconds, and probabilities of `HEARD_EMOTIONS`.
     """
 
     def __init__(
@@ -150,6 +157,8 @@ class EmotionStream:
         self.dropped = self.windows = self.frames = 0
         self.latest = np.eye(len(HEARD_EMOTIONS))[NEUTRAL]
         self.ended = False
+        self.preferred: EmotionTrack | None = None
+        self.found: list[tuple[float, Float64[np.ndarray, " classes"]]] = []
 
     def push(self, samples: Float[np.ndarray, " samples"]) -> Float64[np.ndarray, "frames emotions"]:
         """Take the next samples, 16 kHz; give the strengths that they complete.
@@ -188,12 +197,14 @@ class EmotionStream:
         timeline, received = self.detector.timeline, self.dropped + len(self.samples)
         whole = round(timeline.window * RATE)
         parts = []
+        self.found = []
         while True:
             start, end = timeline.span(self.windows, received)
             if end - start < whole:
                 break
             parts.append(self._frames(end))
             self.latest = self.detector.probabilities(self.samples[start - self.dropped : end - self.dropped])
+            self.found.append((end / RATE, self.latest))
             self.windows += 1
         parts.append(self._frames(received))
         keep = timeline.span(self.windows, received)[0] - self.dropped
@@ -205,8 +216,10 @@ class EmotionStream:
         """Frames whose times lie before a sample, by the window that is known."""
         step = self.processor.options.fixed_dt * RATE
         count = max(0, math.ceil(end / step - 1e-9) - self.frames)
+        times = (self.frames + np.arange(count)) * self.processor.options.fixed_dt
+        preferred = None if self.preferred is None else self.preferred.at(times).double().numpy()
         self.frames += count
-        return self.processor.push(np.repeat(self.latest[None], count, 0))
+        return self.processor.push(np.repeat(self.latest[None], count, 0), preferred)
 
 
 @dataclass(frozen=True)

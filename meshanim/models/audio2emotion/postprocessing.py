@@ -23,9 +23,9 @@ class EmotionOptions:
     max_emotions : int
         Strongest emotions that are kept, neutral not counted; 1 to 6.
     live_blend_coef : float
-        Share of the frame before in each frame, 0 (none) to below 1.
+        Share of the frame before in each frame, 0 (none) to 1 (never anything new).
     enable_preferred_emotion : bool
-        Whether `preferred` is blended in.
+        Whether `preferred` is blended in, where one is given.
     preferred : mapping of str to float
         Strengths of a face's emotions.
     preferred_emotion_strength : float
@@ -60,7 +60,7 @@ class EmotionOptions:
         for name, low, high in (
             ("emotion_contrast", 0, 3),
             ("max_emotions", 1, len(HEARD_EMOTIONS)),
-            ("live_blend_coef", 0, 0.999),
+            ("live_blend_coef", 0, 1),
             ("preferred_emotion_strength", 0, 1),
             ("transition_smoothing", 0, 10),
             ("emotion_strength", 0, 1),
@@ -97,7 +97,7 @@ class EmotionPostProcessor:
         for name, own in options.correspondence.items():
             if own in self.emotions:
                 self.table[HEARD_EMOTIONS.index(name), self.emotions.index(own)] = 1.0
-        self.preferred = self._strengths(options.preferred)
+        self.preferred = self._strengths(options.preferred) if options.preferred else None
         self.smoothed = self.state = self._strengths(options.beginning)
 
     def _strengths(self, mixture: Mapping[str, float]) -> Float64[np.ndarray, " emotions"]:
@@ -109,7 +109,9 @@ class EmotionPostProcessor:
         return values
 
     def push(
-        self, probabilities: Float[np.ndarray, "frames classes"]
+        self,
+        probabilities: Float[np.ndarray, "frames classes"],
+        preferred: Float[np.ndarray, "frames emotions"] | None = None,
     ) -> Float64[np.ndarray, "frames emotions"]:
         """Strengths of the next frames, `fixed_dt` seconds apart.
 
@@ -117,6 +119,8 @@ class EmotionPostProcessor:
         ----------
         probabilities : (T, 6)
             Of `HEARD_EMOTIONS`.
+        preferred : (T, E), optional
+            Of every frame, instead of the options' one.
 
         Raises
         ------
@@ -126,20 +130,36 @@ class EmotionPostProcessor:
         given = np.asarray(probabilities, np.float64)
         if not np.isfinite(given).all() or (given < 0).any():
             raise ShapeError("probabilities of emotions must be finite and not negative")
-        return np.stack([self._frame(row) for row in given]) if len(given) else self.state[None][:0]
+        wishes = [self.preferred] * len(given) if preferred is None else preferred
+        frames = [self._frame(row, wish) for row, wish in zip(given, wishes, strict=True)]
+        return np.stack(frames) if frames else self.state[None][:0]
 
-    def _frame(self, probabilities: Float64[np.ndarray, " classes"]) -> Float64[np.ndarray, " emotions"]:
-        options = self.options
-        logits = options.emotion_contrast * np.log(probabilities + 1e-9)
+    def heard(self, probabilities: Float64[np.ndarray, " classes"]) -> Float64[np.ndarray, " emotions"]:
+        """The strongest classes as emotions of the face, before anything is blended or smoothed."""
+        logits = self.options.emotion_contrast * np.log(probabilities + 1e-9)
         heard = np.exp(logits - logits.max())
         heard = heard / heard.sum() * self.table.any(1)
-        heard[np.argsort(-heard, kind="stable")[options.max_emotions :]] = 0
+        heard[np.argsort(-heard, kind="stable")[self.options.max_emotions :]] = 0
+        return heard @ self.table
+
+    def blended(
+        self, strengths: Float64[np.ndarray, " emotions"], preferred: Float64[np.ndarray, " emotions"] | None
+    ) -> Float64[np.ndarray, " emotions"]:
+        """With the preferred emotion, where there is one and the options want it."""
+        if preferred is None or not self.options.enable_preferred_emotion:
+            return strengths
+        share = self.options.preferred_emotion_strength
+        return (1 - share) * strengths + share * preferred
+
+    def _frame(
+        self,
+        probabilities: Float64[np.ndarray, " classes"],
+        preferred: Float64[np.ndarray, " emotions"] | None,
+    ) -> Float64[np.ndarray, " emotions"]:
+        options = self.options
         blend = options.live_blend_coef
-        self.smoothed = (1 - blend) * (heard @ self.table) + blend * self.smoothed
-        wanted = self.smoothed
-        if options.enable_preferred_emotion:
-            share = options.preferred_emotion_strength
-            wanted = (1 - share) * wanted + share * self.preferred
+        self.smoothed = (1 - blend) * self.heard(probabilities) + blend * self.smoothed
+        wanted = self.blended(self.smoothed, preferred)
         seconds = options.transition_smoothing
         step = min(options.fixed_dt / seconds, 1.0) if seconds > 0 else 1.0
         self.state = self.state + step * (wanted - self.state)
