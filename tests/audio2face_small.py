@@ -89,10 +89,17 @@ def small_diffusion(seed=0, **options):
             layer.bias.normal_(std=0.2)
         network.feature_mean.fill_(-8.0)
         network.feature_scale.fill_(3.0)
-        for layer in (*network.geometry, network.geometry_mix, network.speech_mix):
+        # Geometry goes to the output directly, too, and with every step again.
+        for layer, size in (
+            *((g, 0.05) for g in network.geometry),
+            (network.geometry_mix, 0.1),
+            (network.speech_mix, 0.2),
+        ):
             if layer is not None:
-                layer.weight.normal_(std=0.2)
+                layer.weight.normal_(std=size)
         for weight in network.recurrent.parameters():
             weight.normal_(std=0.3)
+        network.trust.weight.fill_(1.0)
+        network.manner.weight.normal_(std=0.1)
         network.mean.normal_(std=0.1)
     return network.eval()

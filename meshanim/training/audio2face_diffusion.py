@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from accelerate import PartialState
-from jaxtyping import Float32
+from jaxtyping import Float, Float32, Int
 from torch import Tensor, nn
 from tyro.conf import UseAppendAction
 
@@ -28,6 +28,7 @@ from meshanim.training.audio2face_losses import (
     lip_distance_loss,
     smoothness_loss,
 )
+from meshanim.training.diffusion_components import ComponentDiffusion, upper_shapes
 from meshanim.training.trainer import TrainConfig, Trainer
 
 __all__ = ["DiffusionTask", "DiffusionWeights", "Target", "TrainDiffusionOptions", "train_diffusion"]
@@ -93,8 +94,16 @@ class TrainDiffusionOptions:
     """Of projections, recurrent state and decoder."""
     dropout: float = 0.3
     """Between the layers of the GRU."""
+    skin: Literal["vertices", "components"] = "vertices"
+    """What a training step computes of the skin: every vertex, or coefficients of the data's components, of
+    which the finished network makes vertices. It is the same network where these are all the motion."""
     segment: tuple[int, int] = (30, 600)
     """Fewest and most frames of a training segment."""
+    batch: int = 1
+    """Segments side by side, of the same length."""
+    pure_noise: float = 0.5
+    """Share of the segments of which only noise is seen, as in the first denoising step; the others are
+    noised to any degree."""
     epochs: int = 400
     """Passes over the clips, a random segment of each; 0 leaves it to train.steps."""
     warmup_epochs: int = 10
@@ -111,8 +120,13 @@ class TrainDiffusionOptions:
     """Stay on the CPU."""
 
     def __post_init__(self):
-        if self.epochs < 0 or self.warmup_epochs < 0 or not 0 <= self.substitution <= 1:
-            raise OptionError("epochs must not be negative, substitution a share from 0 to 1")
+        if self.epochs < 0 or self.warmup_epochs < 0 or self.batch < 1:
+            raise OptionError("epochs must not be negative, and a batch needs a segment")
+        for name in ("substitution", "pure_noise"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise OptionError(f"{name} is a share from 0 to 1, not {getattr(self, name)}")
+        if self.skin == "components" and self.target == "rig":
+            raise OptionError("a rig has weights, no components: leave out --skin")
         if not 2 <= self.segment[0] <= self.segment[1]:
             raise OptionError(
                 f"segments of {self.segment[0]} to {self.segment[1]} frames; expected 2 or more"
@@ -128,10 +142,12 @@ class Target:
         The data.
     config : DiffusionConfig
         Says which numbers.
+    components : bool
+        Coefficients of the skin in place of vertices.
     """
 
-    def __init__(self, states: AnimationStates, config: DiffusionConfig):
-        self.states, self.config = states, config
+    def __init__(self, states: AnimationStates, config: DiffusionConfig, components: bool = False):
+        self.states, self.config, self.components = states, config, components
         self.motions: dict[str, tuple[Tensor | None, Tensor | None]] = {}
 
     def motion(self, sequence: str) -> tuple[Tensor | None, Tensor | None]:
@@ -165,6 +181,8 @@ class Target:
         parts = []
         if curves is not None:
             parts.append(torch.from_numpy(at_positions(curves.numpy(), timeline)))
+        elif self.components:
+            parts.append(torch.from_numpy(clip.arrays.state[rows]))
         else:
             basis = self.states.basis
             vertices = torch.from_numpy(self.states.vertices(clip.clip.name, timeline))
@@ -183,6 +201,10 @@ class Target:
                 if head is not None and bool(head.abs().max() > 1e-4):
                     return True
         return False
+
+
+def _draw(chance: torch.Generator, low: int, high: int) -> int:
+    return int(torch.randint(low, high + 1, (), generator=chance))
 
 
 class DiffusionTask:
@@ -208,6 +230,10 @@ class DiffusionTask:
         Identities with head motion.
     substitution : float
         Share of their segments that stand for an identity without it.
+    size : int
+        Segments side by side.
+    pure_noise : float
+        Share of the segments at the last time of the schedule.
     seed : int
         Of everything random.
     """
@@ -223,6 +249,8 @@ class DiffusionTask:
         sentences: Mapping[str, Tensor] | None = None,
         turning: Sequence[str] = (),
         substitution: float = 0.3,
+        size: int = 1,
+        pure_noise: float = 0.5,
         seed: int = 0,
     ):
         self.config, self.parts, self.schedule = network.config, network.parts, network.schedule
@@ -230,18 +258,21 @@ class DiffusionTask:
         self.target, self.clips, self.rate, self.weights = target, clips, rate, weights
         self.segment, self.sentences, self.seed = segment, sentences or {}, seed
         self.turning, self.substitution = set(turning), substitution
+        self.size, self.pure_noise = size, pure_noise
         self.still = [k for k, name in enumerate(self.config.identities) if name not in self.turning]
         self.lips = LipReader(network.actors)
         self.people = list(network.actors.templates)
-        parts = network.actors.basis.parts
+        basis, self.components = network.actors.basis, isinstance(network, ComponentDiffusion)
+        parts = basis.parts
         self.upper = torch.from_numpy(
             np.searchsorted(parts.skin, np.intersect1d(parts.upper_face, parts.skin))
         )
+        self.upper_shapes = upper_shapes(basis, self.upper) if self.components else None
         self.units = torch.full((network.numbers,), CENTIMETRES)
         for part in self.parts:
-            if part.name == "tongue":
+            if part.name == "tongue" or (part.name == "skin" and self.components):
                 # Coefficients so that their mean square is that of the vertices' displacements.
-                self.units[part.columns] *= (part.size / (3 * len(parts.tongue))) ** 0.5
+                self.units[part.columns] *= (part.size / (3 * len(getattr(parts, part.name)))) ** 0.5
             elif part.name == "eyes":
                 self.units[part.columns] = EYE_RADIUS
             elif part.name == "rig":
@@ -250,44 +281,51 @@ class DiffusionTask:
                 self.units[part.columns][:6] = LEVER
 
     def batch(self, number: int, share: int = 0, shares: int = 1) -> dict[str, Any]:
-        """A segment of the clip whose turn it is; an epoch is a permutation of the clips."""
-        place = number * shares + share
+        """Segments of the clips whose turn it is; an epoch is a permutation of the clips."""
+        first = (number * shares + share) * self.size
+        clips = [self._clip(place) for place in range(first, first + self.size)]
+        chances = [
+            torch.Generator().manual_seed((self.seed + 1) * 7_000_003 + first + k) for k in range(self.size)
+        ]
+        shortest = min(map(len, clips))
+        fewest, most = (min(bound, shortest) for bound in self.segment)
+        counts = [_draw(chance, fewest, most) for chance in chances]
+        rows = [self._segment(clip, counts[0], chance) for clip, chance in zip(clips, chances)]
+        return {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
+
+    def _clip(self, place: int) -> SpeechClip:
         epoch, turn = divmod(place, len(self.clips))
         order = torch.randperm(
             len(self.clips), generator=torch.Generator().manual_seed(self.seed * 1_000_003 + epoch)
         )
-        clip = self.clips[int(order[turn])]
-        chance = torch.Generator().manual_seed((self.seed + 1) * 7_000_003 + place)
+        return self.clips[int(order[turn])]
 
-        def draw(low: int, high: int) -> int:
-            return int(torch.randint(low, high + 1, (), generator=chance))
-
-        fewest, most = (min(bound, len(clip)) for bound in self.segment)
-        count = draw(fewest, most)
-        first = draw(0, len(clip) - count)
+    def _segment(self, clip: SpeechClip, count: int, chance: torch.Generator) -> dict[str, Tensor]:
+        first = _draw(chance, 0, len(clip) - count)
         times = (torch.arange(first, first + count, dtype=torch.float64) + 0.5) / self.config.fps
         clean = self.target.frames(clip, first, first + count)
         identity = list(self.config.identities).index(clip.clip.subject)
         turns = clip.clip.subject in self.turning
         coin = float(torch.rand((), generator=chance))
-        other = draw(0, max(len(self.still) - 1, 0))
+        other = _draw(chance, 0, max(len(self.still) - 1, 0))
         only_head = turns and bool(self.still) and coin < self.substitution
+        pure = float(torch.rand((), generator=chance)) < self.pure_noise
         return {
-            "features": clip.features_at(self.rate, times)[None],
-            "clean": clean[None],
-            "noise": torch.randn(1, count, clean.shape[1], generator=chance),
-            "times": torch.tensor([draw(0, self.config.steps - 1)]),
-            "emotions": self._mood(clip.clip, count, draw)[None],
-            "identities": torch.tensor([self.still[other] if only_head else identity]),
-            "subject": self.people.index(clip.clip.subject),
-            "head": turns,
-            "face": not only_head,
+            "features": clip.features_at(self.rate, times),
+            "clean": clean,
+            "noise": torch.randn(count, clean.shape[1], generator=chance),
+            "times": torch.tensor(self.config.steps - 1 if pure else _draw(chance, 0, self.config.steps - 1)),
+            "emotions": self._mood(clip.clip, count, chance),
+            "identities": torch.tensor(self.still[other] if only_head else identity),
+            "subject": torch.tensor(self.people.index(clip.clip.subject)),
+            "head": torch.tensor(turns),
+            "face": torch.tensor(not only_head),
         }
 
-    def _mood(self, clip: StateClip, count: int, draw) -> Tensor:
+    def _mood(self, clip: StateClip, count: int, chance: torch.Generator) -> Tensor:
         if self.config.text:
             rows = self.sentences[clip.name]
-            return rows[draw(0, len(rows) - 1)].expand(count, -1)
+            return rows[_draw(chance, 0, len(rows) - 1)].expand(count, -1)
         strengths = torch.zeros(count, len(self.config.emotions))
         if clip.emotion in self.config.emotions:
             strengths[:, self.config.emotions.index(clip.emotion)] = clip.intensity
@@ -301,36 +339,51 @@ class DiffusionTask:
         found = mean + scale * model(
             batch["features"], noisy, batch["times"], batch["emotions"], batch["identities"]
         )
-        error = ((found - truth) * units)[0].square()
-        weights, zero = self.weights, found.sum() * 0
+        error = ((found - truth) * units).square()
+        weights = self.weights
         # What does not count is multiplied by zero: every parameter gets a gradient on every process.
-        face, head = float(batch["face"]), float(batch["head"])
-        terms, loss = {}, zero
+        face, head = batch["face"].to(error), batch["head"].to(error)
+        terms, loss = {}, found.sum() * 0
         for part in self.parts:
-            weight = getattr(weights, part.name, 1.0) * (head if part.name == "head" else face)
-            terms[part.name] = error[:, part.columns].mean() * float(weight > 0)
+            weight, counted = getattr(weights, part.name, 1.0), head if part.name == "head" else face
+            terms[part.name] = (error[..., part.columns].mean((1, 2)) * counted).mean()
             loss = loss + weight * terms[part.name]
         if self.parts[0].name == "skin":
-            skin, true = (x[0, :, self.parts[0].columns].unflatten(1, (-1, 3)) for x in (found, truth))
+            columns = self.parts[0].columns
             if len(self.upper):
-                moved = skin[:, self.upper.to(skin.device)].flatten(1) * CENTIMETRES
-                terms["upper_face"] = smoothness_loss(moved) * face
+                smooth = smoothness_loss(self._upper_face(found[..., columns]) * CENTIMETRES)
+                terms["upper_face"] = (smooth * face).mean()
                 loss = loss + weights.upper_face * terms["upper_face"]
-            self.lips.to(skin.device)
-            subject = torch.full((len(skin),), batch["subject"], device=skin.device)
-            opening, true_opening = (self.lips.of_skin(x, subject)[0] for x in (skin, true))
-            terms["lip_distance"] = lip_distance_loss(opening, true_opening, weights.gamma) * face
+            self.lips.to(found.device)
+            subject = batch["subject"][:, None].expand(found.shape[:2])
+            opening, true_opening = (self._openings(x[..., columns], subject) for x in (found, truth))
+            opening = torch.where(batch["face"][:, None, None], opening, true_opening)
+            terms["lip_distance"] = lip_distance_loss(opening, true_opening, weights.gamma)
             loss = loss + weights.lip_distance * terms["lip_distance"]
         if self.config.head_motion:
-            columns = self.parts[-1].columns
-            motion = (found * units)[0, :, columns]
-            terms["acceleration"] = (acceleration_loss(motion) if len(motion) > 2 else zero) * head
+            motion = (found * units)[..., self.parts[-1].columns]
+            terms["acceleration"] = (
+                (acceleration_loss(motion) * head).mean() if motion.shape[1] > 2 else 0 * loss
+            )
             loss = loss + weights.acceleration * terms["acceleration"]
         return loss, terms
 
+    def _upper_face(self, skin: Float[Tensor, "batch frames numbers"]) -> Float[Tensor, "batch frames upper"]:
+        """Displacements of the upper face, or numbers with the same mean square differences."""
+        if self.upper_shapes is not None:
+            return skin @ self.upper_shapes.to(skin)
+        return skin.unflatten(2, (-1, 3))[:, :, self.upper.to(skin.device)].flatten(2)
+
+    def _openings(
+        self, skin: Float[Tensor, "batch frames numbers"], subject: Int[Tensor, "batch frames"]
+    ) -> Float[Tensor, "batch frames lips"]:
+        if self.components:
+            return self.lips.of_states(skin, subject)[0]
+        return self.lips.of_skin(skin.unflatten(2, (-1, 3)), subject)[0]
+
     def save(self, model: nn.Module, directory: Path) -> None:
         assert isinstance(model, Audio2FaceDiffusion)
-        model.save_pretrained(directory)
+        (model.folded() if isinstance(model, ComponentDiffusion) else model).save_pretrained(directory)
 
 
 def train_diffusion(options: TrainDiffusionOptions, progress: bool = True) -> Path:
@@ -377,8 +430,9 @@ def train_diffusion(options: TrainDiffusionOptions, progress: bool = True) -> Pa
         text_encoder=options.text_encoder if told else "",
     )
     actors = Actors(states.basis, {name: states.templates[name] for name in people}, states.faces)
-    network = Audio2FaceDiffusion(config, actors)
-    target = Target(states, config)
+    components = options.skin == "components"
+    network = (ComponentDiffusion if components else Audio2FaceDiffusion)(config, actors)
+    target = Target(states, config, components)
     turning = [name for name in people if options.head_motion and target.turns(name)]
     if options.head_motion and not turning:
         raise OptionError(f"no head turns in {options.data}: leave out --head-motion")
@@ -393,9 +447,11 @@ def train_diffusion(options: TrainDiffusionOptions, progress: bool = True) -> Pa
         _sentences(states, clips, told) if told else None,
         turning,
         options.substitution,
+        options.batch,
+        options.pure_noise,
         options.train.seed,
     )
-    epoch = len(clips) / state.num_processes / options.train.accumulation
+    epoch = len(clips) / state.num_processes / options.train.accumulation / options.batch
     train = options.train
     if options.epochs:
         warmup = round(options.warmup_epochs * epoch)
@@ -448,10 +504,14 @@ def set_statistics(
     for part in network.parts:
         columns = part.columns
         if part.name == "skin":
-            count = part.size
-            network.mean[columns] = basis.skin_mean.flatten()
+            count = 3 * len(basis.parts.skin)
+            if not isinstance(network, ComponentDiffusion):
+                network.mean[columns] = basis.skin_mean.flatten()
             spread = states[:, at["skin"]].square().sum(1).mean() / count
             network.scale[columns] = float(spread.sqrt().clamp_min(1e-6))
+            if isinstance(network, ComponentDiffusion):
+                sizes = states[:, at["skin"]].square().mean(0).sqrt() / network.scale[columns]
+                network.gain[columns] = sizes.clamp_min(1).float()
             continue
         if part.name in ("rig", "head"):
             chosen = [c for c in clips if c.clip.made == "recorded"]

@@ -7,7 +7,7 @@ metres here; `state_units` and `CENTIMETRES` bring them to the scale of those we
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -154,20 +154,14 @@ def lip_size_loss(
     return (predicted - true).square().sum((-2, -1)).mean()
 
 
-def smoothness_loss(
-    motion: Float[Tensor, "frames numbers"], counted: Bool[Tensor, " frames"] | None = None
-) -> Float[Tensor, ""]:
-    """Mean squared difference of adjacent frames (Eq. 8, on the upper face), of those that both count."""
-    error = motion.diff(dim=0).square().mean(-1)
-    if counted is None:
-        return error.mean()
-    both = counted[1:] & counted[:-1]
-    return (error * both).sum() / both.sum().clamp_min(1)
+def smoothness_loss(motion: Float[Tensor, "*batch frames numbers"]) -> Float[Tensor, "*batch"]:
+    """Mean squared difference of adjacent frames, of each motion (Eq. 8, on the upper face)."""
+    return motion.diff(dim=-2).square().mean((-2, -1))
 
 
-def acceleration_loss(motion: Float[Tensor, "frames numbers"]) -> Float[Tensor, ""]:
-    """Mean squared second difference (Eq. 15)."""
-    return motion.diff(n=2, dim=0).square().mean()
+def acceleration_loss(motion: Float[Tensor, "*batch frames numbers"]) -> Float[Tensor, "*batch"]:
+    """Mean squared second difference, of each motion of three frames or more (Eq. 15)."""
+    return motion.diff(n=2, dim=-2).square().mean((-2, -1))
 
 
 class LipReader(nn.Module):

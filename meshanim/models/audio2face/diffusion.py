@@ -124,6 +124,12 @@ class Part(NamedTuple):
         return self.columns.stop - self.columns.start
 
 
+def _waves(steps: int, width: int) -> Float[Tensor, "steps width"]:
+    """Cosines and sines of one to 64 half turns over the steps."""
+    turns = torch.arange(steps)[:, None] / steps * 2.0 ** (torch.arange(width) // 2 % 7)
+    return torch.cos(torch.pi * (turns + 0.5 * (torch.arange(width) % 2)))
+
+
 class IdentityExperts(nn.Module):
     """A feed-forward layer whose first half is an expert for each identity: h + W gelu(M_i h + b_i).
 
@@ -168,9 +174,15 @@ class Audio2FaceDiffusion(ActorCheckpoint):
 
     Notes
     -----
-    The paper names the projections, the GRU and the decoder; sizes are the public code's. Mixing speech over
-    nine frames is ours: HuBERT's features know what comes, those of streaming encoders only in part. With
-    target "rig" the noisy weights go into the GRU as they are, and a linear layer decodes (Sec. 9.3.2).
+    The paper names the projections, the GRU and the decoder; sizes are the public code's. With target "rig"
+    the noisy weights go into the GRU as they are, and a linear layer decodes (Sec. 9.3.2). Ours are:
+
+    - Speech mixed over nine frames: HuBERT's features know what comes, those of streaming encoders in part.
+    - `trust`, a factor on what is noisy for each time; it begins as the share of the signal, so that pure
+      noise does not drown the speech.
+    - `manner`: emotion and identity scale and shift the decoder's hidden numbers (FiLM; Perez et al., AAAI
+      2018), besides being inputs of the GRU.
+    - The mixed geometry goes to the last layers directly, too: what can be seen need not be remembered.
     """
 
     title = "Audio2Face-3D diffusion network"
@@ -199,6 +211,7 @@ class Audio2FaceDiffusion(ActorCheckpoint):
             projected = sum(part.projected for part in self.parts)
             self.geometry_mix = nn.Conv1d(projected, width, KERNEL, padding=REACH)
         self.time = nn.Embedding(config.steps, width)
+        self.trust = nn.Embedding(config.steps, 1)
         self.emotion = nn.Linear(max(config.mood, 1), NARROW)
         self.identity = nn.Embedding(len(config.identities), NARROW)
         self.recurrent = nn.GRU(
@@ -210,9 +223,15 @@ class Audio2FaceDiffusion(ActorCheckpoint):
         )
         self.hidden = nn.Identity() if rig else nn.Sequential(nn.Linear(width, width), nn.Mish())
         self.outputs = nn.ModuleList(nn.Linear(width, part.size) for part in self.parts)
+        self.manner = nn.Linear(2 * NARROW, 2 * width)
         with torch.no_grad():
-            for parameter in self.outputs.parameters():
+            for parameter in (*self.outputs.parameters(), *self.manner.parameters()):
                 parameter.zero_()
+            # Times that are near begin alike; noise counts for nothing where there is nothing else.
+            self.time.weight.copy_(_waves(config.steps, width))
+            self.trust.weight.copy_(torch.from_numpy(self.schedule.kept).sqrt()[:, None])
+            # As large as the embeddings beside it.
+            self.emotion.weight.normal_()
         self.register_buffer("feature_mean", torch.zeros(config.feature_dim))
         self.register_buffer("feature_scale", torch.ones(config.feature_dim))
         self.register_buffer("mean", torch.zeros(self.numbers))
@@ -253,7 +272,7 @@ class Audio2FaceDiffusion(ActorCheckpoint):
             steps = self.experts(steps, chosen)
         spoken = self.speech(steps)
         spoken = functional.mish(self.speech_mix(spoken.mT).mT)
-        shape = noisy
+        shape = noisy = self.trust(times)[:, None] * noisy
         if self.geometry_mix is not None:
             parts = zip(self.parts, self.geometry)
             shape = torch.cat([layer(noisy[..., part.columns]) for part, layer in parts], -1)
@@ -262,11 +281,16 @@ class Audio2FaceDiffusion(ActorCheckpoint):
             emotions = spoken.new_zeros(*spoken.shape[:2], 1)
         still = torch.cat([functional.mish(self.time(times)), self.identity(identities)], dim=-1)
         still = still[:, None].expand(-1, spoken.shape[1], -1)
-        return torch.cat([spoken, shape, self.emotion(emotions), still], dim=-1)
+        return torch.cat([spoken, shape, still, self.emotion(emotions)], dim=-1)
 
-    def decode(self, hidden: Float[Tensor, "batch frames width"]) -> Float[Tensor, "batch frames numbers"]:
-        """X_0, about the mean, in deviations."""
-        hidden = self.hidden(hidden)
+    def decode(
+        self, hidden: Float[Tensor, "batch frames width"], inputs: Float[Tensor, "batch frames inputs"]
+    ) -> Float[Tensor, "batch frames numbers"]:
+        """X_0, about the mean, in deviations, of the GRU's output and what it read."""
+        gain, offset = self.manner(inputs[..., -2 * NARROW :]).chunk(2, dim=-1)
+        hidden = (1 + gain) * self.hidden(hidden) + offset
+        if self.geometry_mix is not None:
+            hidden = hidden + inputs[..., self.config.width : 2 * self.config.width]
         return torch.cat([layer(hidden) for layer in self.outputs], dim=-1)
 
     def forward(
@@ -302,7 +326,8 @@ class Audio2FaceDiffusion(ActorCheckpoint):
                 f"features have width {features.shape[2]} and frames {noisy.shape[2]}; expected "
                 f"{self.config.feature_dim} and {self.numbers}"
             )
-        return self.decode(self.recurrent(self.encode(features, noisy, times, emotions, identities))[0])
+        inputs = self.encode(features, noisy, times, emotions, identities)
+        return self.decode(self.recurrent(inputs)[0], inputs)
 
     @torch.inference_mode()
     def sample(

@@ -173,7 +173,7 @@ class DiffusionStream:
             self.states[number] = state
             if last > end:
                 hidden = torch.cat([hidden, model.recurrent(inputs[:, count:], state)[0]], dim=1)
-            clean = model.decode(hidden)
+            clean = model.decode(hidden, inputs)
             x = step.clean * clean + step.noisy * x
             if number + 1 < len(self.plan):
                 x = x + step.deviation * noise[number + 1]

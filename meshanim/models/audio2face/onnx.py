@@ -207,20 +207,22 @@ class DiffusionGraph(nn.Module):
             seen = torch.cat([input_frames[number, :, :, :-1], x], dim=1)
             kept = torch.cat([seen, exists], dim=2)[:, : REACH + self.block][:, -REACH:]
             frames.append(kept)
+            trust = network.trust.weight[step.time]
             if network.geometry_mix is None:
-                shape = x
+                shape = trust * x
             else:
                 parts = zip(network.parts, network.geometry)
-                shape = torch.cat([layer(seen[..., part.columns]) for part, layer in parts], -1) * exists
+                shape = [layer(trust * seen[..., part.columns]) for part, layer in parts]
+                shape = torch.cat(shape, -1) * exists
                 shape = network.geometry_mix(shape.transpose(1, 2)).transpose(1, 2)[:, REACH:]
             time = functional.mish(network.time.weight[step.time])
             still = torch.cat([time.expand(who.shape[0], -1), who], dim=-1)
             still = still[:, None].expand(-1, count, -1)
-            hidden = torch.cat([spoken, shape, mood, still], dim=-1)
+            hidden = inputs = torch.cat([spoken, shape, still, mood], dim=-1)
             for row, layer in enumerate(self.layers):
                 hidden = layer(hidden, input_latents[number, row][None].contiguous())[0]
                 latents.append(hidden[:, : self.block][:, -1])
-            clean = network.decode(hidden)
+            clean = network.decode(hidden, inputs)
             x = step.clean * clean + step.noisy * x
             if number + 1 < len(self.plan):
                 x = x + step.deviation * noise[:, number + 1]
