@@ -119,8 +119,8 @@ class PostProcessing:
 
 _FRAMEWORK = PostProcessing(
     input_strength=1.3, lower_face_strength=1.7, skin_strength=1.1, lip_open_offset=-0.05,
-    lower_teeth_strength=1.3, lower_teeth_height_offset=-0.1, lower_teeth_depth_offset=0.25,
-    tongue_depth_offset=-0.3, saccade_strength=0.9, right_eye_rot_y_offset=-2.0, left_eye_rot_y_offset=2.0,
+    lower_teeth_strength=1.3, tongue_depth_offset=-0.3, saccade_strength=0.9, right_eye_rot_y_offset=-2.0,
+    left_eye_rot_y_offset=2.0,
 )  # fmt: skip
 _CLAIRE = PostProcessing(
     lower_face_strength=1.25, lower_face_smoothing=0.006, eyelid_open_offset=0.0, lip_open_offset=0.0,
@@ -142,7 +142,9 @@ PRESETS: Mapping[str, PostProcessing] = {
     ),
 }  # fmt: skip
 """`neutral` changes nothing. Published are the SDK's defaults, those of the training framework for regression
-and diffusion, and the settings of three actors in the sample clients (what they leave out is the SDK's)."""
+and diffusion, and the settings of three actors in the sample clients (what they leave out is the SDK's). The
+framework's offsets of the lower teeth (height -0.1, depth 0.25) are left out: they are for the teeth of its
+actors, and push those of the default head through the lip."""
 
 
 @dataclass(frozen=True)

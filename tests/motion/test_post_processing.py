@@ -273,7 +273,8 @@ def test_model_config_json_and_keyframes(tmp_path):
         '"source_shot": "cp1_neutral", "source_frame": 12}}'
     )
     found = load_post_settings(path)
-    assert found.track == PostTrack.of(PRESETS["framework"])
+    published = replace(PRESETS["framework"], lower_teeth_height_offset=-0.1, lower_teeth_depth_offset=0.25)
+    assert found.track == PostTrack.of(published)
     assert found.source == ("cp1_neutral", 12)
     path = tmp_path / "moving.yml"
     path.write_text(
