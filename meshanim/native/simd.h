@@ -43,6 +43,7 @@ inline Floats magnitude(Floats a) { return _mm512_andnot_ps(_mm512_set1_ps(-0.0f
 inline Floats negative(Floats a) { return _mm512_or_ps(_mm512_set1_ps(-0.0f), a); }  // minus the magnitude
 // a times two to the power n, n whole and within +-300.
 inline Floats scale_by_power(Floats a, Floats n) { return _mm512_scalef_ps(a, n); }
+inline Floats power_of_two(Floats n) { return _mm512_scalef_ps(_mm512_set1_ps(1.0f), n); }  // n whole, -126 to 127
 
 // Lane i is p[offsets[i]].
 inline Floats gather(const float *p, const int32_t *offsets) { return _mm512_i32gather_ps(_mm512_loadu_si512(offsets), p, 4); }
@@ -147,6 +148,65 @@ inline void transpose_quads(Floats (&v)[LANES / 4]) {
     v[2] = _mm512_shuffle_f32x4(b, d, 0x88), v[3] = _mm512_shuffle_f32x4(b, d, 0xdd);
 }
 
+// Lane i of quad k of row j becomes lane j of quad k of row i.
+inline void transpose_in_quads(Floats (&v)[4]) {
+    const __m512d a = _mm512_castps_pd(_mm512_unpacklo_ps(v[0], v[1])), b = _mm512_castps_pd(_mm512_unpackhi_ps(v[0], v[1]));
+    const __m512d c = _mm512_castps_pd(_mm512_unpacklo_ps(v[2], v[3])), d = _mm512_castps_pd(_mm512_unpackhi_ps(v[2], v[3]));
+    v[0] = _mm512_castpd_ps(_mm512_unpacklo_pd(a, c)), v[1] = _mm512_castpd_ps(_mm512_unpackhi_pd(a, c));
+    v[2] = _mm512_castpd_ps(_mm512_unpacklo_pd(b, d)), v[3] = _mm512_castpd_ps(_mm512_unpackhi_pd(b, d));
+}
+
+// Lane l of column j is p[3 l + j].
+inline void load_columns(const float *p, Floats (&columns)[3]) {
+    struct Picks {
+        int32_t first[3][LANES], second[3][LANES];
+        Picks() {
+            for (int j = 0; j < 3; ++j)
+                for (int l = 0; l < LANES; ++l) {
+                    const int i = 3 * l + j;
+                    first[j][l] = i < 2 * LANES ? i : 0;
+                    second[j][l] = i < 2 * LANES ? l : i - LANES;   // of what is there already, then of the last vector
+                }
+        }
+    };
+    static const Picks picks;
+    const Floats a = load(p), b = load(p + LANES), c = load(p + 2 * LANES);
+    for (int j = 0; j < 3; ++j) {
+        const Floats most = _mm512_permutex2var_ps(a, _mm512_loadu_si512(picks.first[j]), b);
+        columns[j] = _mm512_permutex2var_ps(most, _mm512_loadu_si512(picks.second[j]), c);
+    }
+}
+inline void store_columns(float *p, const Floats (&columns)[3]) {
+    struct Picks {
+        int32_t first[3][LANES], second[3][LANES];
+        Picks() {
+            for (int k = 0; k < 3; ++k)
+                for (int l = 0; l < LANES; ++l) {
+                    const int row = (LANES * k + l) / 3, column = (LANES * k + l) % 3;
+                    first[k][l] = column < 2 ? column * LANES + row : 0;
+                    second[k][l] = column < 2 ? l : LANES + row;
+                }
+        }
+    };
+    static const Picks picks;
+    for (int k = 0; k < 3; ++k) {
+        const Floats most = _mm512_permutex2var_ps(columns[0], _mm512_loadu_si512(picks.first[k]), columns[1]);
+        store(p + LANES * k, _mm512_permutex2var_ps(most, _mm512_loadu_si512(picks.second[k]), columns[2]));
+    }
+}
+// Lane l of column j is p[4 l + j].
+inline void load_columns(const float *p, Floats (&columns)[4]) {
+    for (int j = 0; j < 4; ++j) columns[j] = load(p + LANES * j);
+    transpose_quads(columns);
+    transpose_in_quads(columns);
+}
+inline void store_columns(float *p, const Floats (&columns)[4]) {
+    Floats v[4] = {columns[0], columns[1], columns[2], columns[3]};
+    transpose_in_quads(v);
+    transpose_quads(v);
+    for (int j = 0; j < 4; ++j) store(p + LANES * j, v[j]);
+}
+
 // Lane i of out[j] is the sum of lanes 4 j to 4 j + 3 of rows[i].
 inline void quad_sums(const Floats (&rows)[LANES], Floats (&out)[LANES / 4]) {
     Floats quads[4];
@@ -188,6 +248,9 @@ inline Floats scale_by_power(Floats a, Floats n) {
     const __m256i rest = _mm256_sub_epi32(whole, half);
     a *= _mm256_castsi256_ps(_mm256_slli_epi32(_mm256_add_epi32(half, bias), 23));
     return a * _mm256_castsi256_ps(_mm256_slli_epi32(_mm256_add_epi32(rest, bias), 23));
+}
+inline Floats power_of_two(Floats n) {
+    return _mm256_castsi256_ps(_mm256_slli_epi32(_mm256_add_epi32(_mm256_cvtps_epi32(n), _mm256_set1_epi32(127)), 23));
 }
 
 inline Floats gather(const float *p, const int32_t *offsets) {
@@ -235,8 +298,8 @@ inline Floats split(Floats a, Floats &exponent) {
     exponent = _mm256_cvtepi32_ps(n);
     return _mm256_castsi256_ps(_mm256_sub_epi32(bits, _mm256_slli_epi32(n, 23)));
 }
+// Within 2 ulp too; a number, whatever x is, but only in that range the right one.
 inline Floats exp2(Floats x) {
-    x = maximum(broadcast(-126.0f), x);
     const Floats n = floor(x), r = x - n;
     Floats p = broadcast(1.877576671e-03f);
     p = fma(p, r, broadcast(8.989340101e-03f));
@@ -272,6 +335,44 @@ inline void transpose_quads(Floats (&v)[LANES / 4]) {
     const Floats a = v[0];
     v[0] = _mm256_permute2f128_ps(a, v[1], 0x20);
     v[1] = _mm256_permute2f128_ps(a, v[1], 0x31);
+}
+inline void transpose_in_quads(Floats (&v)[4]) {
+    const __m256d a = _mm256_castps_pd(_mm256_unpacklo_ps(v[0], v[1])), b = _mm256_castps_pd(_mm256_unpackhi_ps(v[0], v[1]));
+    const __m256d c = _mm256_castps_pd(_mm256_unpacklo_ps(v[2], v[3])), d = _mm256_castps_pd(_mm256_unpackhi_ps(v[2], v[3]));
+    v[0] = _mm256_castpd_ps(_mm256_unpacklo_pd(a, c)), v[1] = _mm256_castpd_ps(_mm256_unpackhi_pd(a, c));
+    v[2] = _mm256_castpd_ps(_mm256_unpacklo_pd(b, d)), v[3] = _mm256_castpd_ps(_mm256_unpackhi_pd(b, d));
+}
+// Quads of four floats from p and q.
+inline Floats load_quads(const float *p, const float *q) {
+    return _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(p)), _mm_loadu_ps(q), 1);
+}
+inline void store_quads(float *p, float *q, Floats a) {
+    _mm_storeu_ps(p, _mm256_castps256_ps128(a));
+    _mm_storeu_ps(q, _mm256_extractf128_ps(a, 1));
+}
+inline void load_columns(const float *p, Floats (&columns)[3]) {
+    const Floats a = load_quads(p, p + 12), b = load_quads(p + 4, p + 16), c = load_quads(p + 8, p + 20);
+    const Floats xy = _mm256_shuffle_ps(b, c, _MM_SHUFFLE(2, 1, 3, 2)), yz = _mm256_shuffle_ps(a, b, _MM_SHUFFLE(1, 0, 2, 1));
+    columns[0] = _mm256_shuffle_ps(a, xy, _MM_SHUFFLE(2, 0, 3, 0));
+    columns[1] = _mm256_shuffle_ps(yz, xy, _MM_SHUFFLE(3, 1, 2, 0));
+    columns[2] = _mm256_shuffle_ps(yz, c, _MM_SHUFFLE(3, 0, 3, 1));
+}
+inline void store_columns(float *p, const Floats (&columns)[3]) {
+    const Floats xy = _mm256_shuffle_ps(columns[0], columns[1], _MM_SHUFFLE(2, 0, 2, 0));
+    const Floats yz = _mm256_shuffle_ps(columns[1], columns[2], _MM_SHUFFLE(3, 1, 3, 1));
+    const Floats zx = _mm256_shuffle_ps(columns[2], columns[0], _MM_SHUFFLE(3, 1, 2, 0));
+    store_quads(p, p + 12, _mm256_shuffle_ps(xy, zx, _MM_SHUFFLE(2, 0, 2, 0)));
+    store_quads(p + 4, p + 16, _mm256_shuffle_ps(yz, xy, _MM_SHUFFLE(3, 1, 2, 0)));
+    store_quads(p + 8, p + 20, _mm256_shuffle_ps(zx, yz, _MM_SHUFFLE(3, 1, 3, 1)));
+}
+inline void load_columns(const float *p, Floats (&columns)[4]) {
+    for (int j = 0; j < 4; ++j) columns[j] = load_quads(p + 4 * j, p + 16 + 4 * j);
+    transpose_in_quads(columns);
+}
+inline void store_columns(float *p, const Floats (&columns)[4]) {
+    Floats v[4] = {columns[0], columns[1], columns[2], columns[3]};
+    transpose_in_quads(v);
+    for (int j = 0; j < 4; ++j) store_quads(p + 4 * j, p + 16 + 4 * j, v[j]);
 }
 inline void quad_sums(const Floats (&rows)[LANES], Floats (&out)[LANES / 4]) {
     Floats quads[2];
@@ -328,6 +429,7 @@ inline float power_of_two(int n) {
     std::memcpy(&result, &bits, sizeof result);
     return result;
 }
+inline Floats power_of_two(Floats n) { return each([&](int i) { return power_of_two(int(n.lane[i])); }); }
 inline Floats scale_by_power(Floats a, Floats n) {
     return each([&](int i) {
         const int whole = n.lane[i] == n.lane[i] ? int(n.lane[i]) : 0, half = whole >> 1;
@@ -398,10 +500,21 @@ inline void transpose(Floats (&rows)[LANES]) {
 }
 inline void spread_quads(Floats a, Floats (&out)[LANES / 4]) { out[0] = a; }
 inline void transpose_quads(Floats (&)[LANES / 4]) {}
+template <int WIDTH>
+inline void load_columns(const float *p, Floats (&columns)[WIDTH]) {
+    for (int j = 0; j < WIDTH; ++j) columns[j] = each([&](int i) { return p[WIDTH * i + j]; });
+}
+template <int WIDTH>
+inline void store_columns(float *p, const Floats (&columns)[WIDTH]) {
+    for (int j = 0; j < WIDTH; ++j)
+        for (int i = 0; i < LANES; ++i) p[WIDTH * i + j] = columns[j].lane[i];
+}
 inline void quad_sums(const Floats (&rows)[LANES], Floats (&out)[LANES / 4]) { out[0] = sums(rows); }
 
 #endif
 
+inline void load_columns(const float *p, Floats (&columns)[1]) { columns[0] = load(p); }
+inline void store_columns(float *p, const Floats (&columns)[1]) { store(p, columns[0]); }
 inline Floats zeros() { return broadcast(0.0f); }
 
 // Combine the lanes whose indices are equal modulo `period` (a power of two); every lane gets its result.

@@ -31,7 +31,6 @@ MESHANIM_DECLARE(int64_t splat_scratch(int64_t entries))
 MESHANIM_DECLARE(void splat_blend_backward(const splat::Scene &, const splat::Backward &))
 MESHANIM_DECLARE(void splat_project_backward(const splat::Scene &, const splat::ParameterGradients &))
 MESHANIM_DECLARE(double fused_multiply_adds(int64_t rounds, int threads, float *out))
-MESHANIM_DECLARE(int pixels_of_block())
 
 namespace {
 
@@ -123,7 +122,7 @@ struct State {
     int64_t items = 0, tiles = 0, entries = 0, longest = 0;
     float *records = nullptr;
     splat::Bins bins{};
-    uint64_t *masks = nullptr;
+    uint16_t *masks = nullptr;
     int32_t *used = nullptr;
     Arena of_items, of_entries;
     SceneHandle handle;
@@ -292,8 +291,8 @@ int64_t pairs(Token token) {
     int64_t blocks = 0;
     for (int64_t tile = 0; tile < state.tiles; ++tile)
         for (int64_t i = 0; i < state.used[tile]; ++i)
-            for (uint64_t mask = state.masks[state.bins.tiles[tile] + i]; mask; mask &= mask - 1) ++blocks;
-    return blocks * MESHANIM_DISPATCH(pixels_of_block);
+            for (uint32_t mask = state.masks[state.bins.tiles[tile] + i]; mask; mask &= mask - 1) ++blocks;
+    return blocks * splat::BLOCK * splat::BLOCK;
 }
 
 }  // namespace

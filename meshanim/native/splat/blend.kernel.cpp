@@ -17,43 +17,59 @@ constexpr int BATCH = 128;   // entries that are listed at once
 // What has been blended into a block so far. The light of a pixel that takes no more is kept with the other sign.
 template <int CHANNELS>
 struct State {
-    Floats light[BLOCKS], color[CHANNELS][BLOCKS];
+    Floats light[BLOCKS][PARTS], color[CHANNELS][BLOCKS][PARTS];
+
+    bool open(int block) const {
+        bool any = false;
+        for (const Floats &part : light[block]) any = any || simd::any(simd::greater(part, broadcast(0.0f)));
+        return any;
+    }
 };
 
 template <int CHANNELS, bool CAPPED>
 void blend_block(const Block &block, int index, const float *local, const int32_t *list, int count, float max_alpha,
                  State<CHANNELS> &state) {
-    const Floats u = block.u, v = block.v, most = broadcast(max_alpha), end = broadcast(splat::MIN_LIGHT);
-    Floats light = state.light[index], color[CHANNELS];
-    for (int j = 0; j < CHANNELS; ++j) color[j] = state.color[j][index];
+    const Floats most = broadcast(max_alpha), end = broadcast(splat::MIN_LIGHT);
+    Floats u[PARTS], v[PARTS], light[PARTS], color[CHANNELS][PARTS];
+    for (int part = 0; part < PARTS; ++part) {
+        u[part] = block.u[part], v[part] = block.v[part];
+        light[part] = state.light[index][part];
+        for (int j = 0; j < CHANNELS; ++j) color[j][part] = state.color[j][index][part];
+    }
     for (int i = 0; i < count; ++i) {
         const float *e = local + list[i];
-        const Floats alpha = visible_alpha<CAPPED>(e, u, v, most), left = simd::fnma(light, alpha, light);
-        const Mask taken = simd::greater(left, end);
-        const Floats weight = simd::keep(taken, light - left);
-        for (int j = 0; j < CHANNELS; ++j) color[j] = fma(weight, broadcast(e[splat::COLOR + j]), color[j]);
-        light = simd::select(taken, left, simd::negative(light));
+        Floats alpha[PARTS];
+        visible_alphas<CAPPED>(e, u, v, most, alpha);
+        for (int part = 0; part < PARTS; ++part) {
+            const Floats left = simd::fnma(light[part], alpha[part], light[part]);
+            const Mask taken = simd::greater(left, end);
+            const Floats weight = simd::keep(taken, light[part] - left);
+            for (int j = 0; j < CHANNELS; ++j) color[j][part] = fma(weight, broadcast(e[splat::COLOR + j]), color[j][part]);
+            light[part] = simd::select(taken, left, simd::negative(light[part]));
+        }
     }
-    state.light[index] = light;
-    for (int j = 0; j < CHANNELS; ++j) state.color[j][index] = color[j];
+    for (int part = 0; part < PARTS; ++part) {
+        state.light[index][part] = light[part];
+        for (int j = 0; j < CHANNELS; ++j) state.color[j][index][part] = color[j][part];
+    }
 }
 
 // A plane of a tile from its blocks, a vector of a row of pixels at a time.
 template <class Value>
 void write_plane(const Scene &scene, const Tile &tile, float *plane, Value value) {
-    constexpr int QUADS = LANES / 4;
-    for (int row = 0; row < BLOCK_ROWS; ++row) {
-        const int top = row * BLOCK_HEIGHT, rows = tile.height - top < BLOCK_HEIGHT ? tile.height - top : BLOCK_HEIGHT;
-        for (int column = 0; column < BLOCK_COLUMNS; column += QUADS) {
-            const int left = column * BLOCK_WIDTH, columns = tile.width - left < LANES ? tile.width - left : LANES;
-            if (columns <= 0) break;
-            Floats blocks[QUADS];
-            for (int j = 0; j < QUADS; ++j) blocks[j] = value(row * BLOCK_COLUMNS + column + j);
-            simd::transpose_quads(blocks);
+    constexpr int QUADS = LANES / BLOCK;
+    for (int first = 0; first < BLOCKS; first += QUADS) {
+        const int left = first % BLOCK_COLUMNS * BLOCK, columns = tile.width - left < LANES ? tile.width - left : LANES;
+        if (columns <= 0) continue;
+        for (int part = 0; part < PARTS; ++part) {
+            const int top = first / BLOCK_COLUMNS * BLOCK + part * QUADS, rows = tile.height - top < QUADS ? tile.height - top : QUADS;
+            Floats quads[QUADS];
+            for (int j = 0; j < QUADS; ++j) quads[j] = value(first + j, part);
+            simd::transpose_quads(quads);
             float *out = plane + int64_t(tile.y + top) * scene.width + tile.x + left;
             for (int j = 0; j < rows; ++j, out += scene.width) {
-                if (columns == LANES) simd::store(out, blocks[j]);
-                else simd::store_first(out, blocks[j], columns);
+                if (columns == LANES) simd::store(out, quads[j]);
+                else simd::store_first(out, quads[j], columns);
             }
         }
     }
@@ -66,10 +82,10 @@ void write_tile(const Scene &scene, const Tile &tile, int group, const State<CHA
     for (int j = 0; j < CHANNELS; ++j) {
         const int64_t channel = int64_t(group) * splat::GROUP + j;
         const Floats behind = broadcast(channel < scene.channels ? scene.background[tile.image * scene.channels + channel] : 0.0f);
-        write_plane(scene, tile, image + channel * area, [&](int b) { return fma(simd::magnitude(state.light[b]), behind, state.color[j][b]); });
+        write_plane(scene, tile, image + channel * area, [&](int b, int part) { return fma(simd::magnitude(state.light[b][part]), behind, state.color[j][b][part]); });
     }
     if (group == 0)
-        write_plane(scene, tile, image + scene.blended() * area, [&](int b) { return broadcast(1.0f) - simd::magnitude(state.light[b]); });
+        write_plane(scene, tile, image + scene.blended() * area, [&](int b, int part) { return broadcast(1.0f) - simd::magnitude(state.light[b][part]); });
 }
 
 template <int CHANNELS>
@@ -80,27 +96,29 @@ void blend_tile(const Scene &scene, const Forward &out, int64_t index, int group
     bool open[BLOCKS];
     for (int b = 0; b < BLOCKS; ++b) {
         const Floats one = broadcast(1.0f);
-        for (int j = 0; j < CHANNELS; ++j) state.color[j][b] = broadcast(0.0f);
-        state.light[b] = simd::select(block_at(b).inside(tile), one, simd::negative(one));
-        open[b] = simd::any(simd::greater(state.light[b], broadcast(0.0f)));
+        for (int part = 0; part < PARTS; ++part) {
+            for (int j = 0; j < CHANNELS; ++j) state.color[j][b][part] = broadcast(0.0f);
+            state.light[b][part] = simd::select(block_at(b).inside(tile, part), one, simd::negative(one));
+        }
+        open[b] = state.open(b);
     }
     alignas(64) float local[BATCH * RECORD];
-    int32_t lists[BLOCKS * (BATCH + LANES)], counts[BLOCKS];
+    int32_t lists[BLOCKS * (BATCH + ROOM)], counts[BLOCKS];
     int64_t first = begin;
     bool any = true;
     for (; first < end && any; first += BATCH) {
         const int count = int(end - first < BATCH ? end - first : BATCH);
-        uint64_t masks[BATCH];
+        uint16_t masks[BATCH];
         const bool capped = load_entries<true>(scene, tile, out.records, out.bins.entries + first, count, out.bins.count - first, group, local, masks, nullptr);
-        if (group == 0) std::memcpy(out.masks + first, masks, sizeof(uint64_t) * size_t(count));
-        list_blocks(masks, count, lists, BATCH + LANES, counts);
+        if (group == 0) std::memcpy(out.masks + first, masks, sizeof(uint16_t) * size_t(count));
+        list_blocks(masks, count, lists, BATCH + ROOM, counts);
         any = false;
         for (int b = 0; b < BLOCKS; ++b) {
             if (!open[b]) continue;
             if (counts[b]) {
                 const auto blend = capped ? blend_block<CHANNELS, true> : blend_block<CHANNELS, false>;
-                blend(block_at(b), b, local, lists + b * (BATCH + LANES), counts[b], scene.max_alpha, state);
-                open[b] = simd::any(simd::greater(state.light[b], broadcast(0.0f)));
+                blend(block_at(b), b, local, lists + b * (BATCH + ROOM), counts[b], scene.max_alpha, state);
+                open[b] = state.open(b);
             }
             any = any || open[b];
         }

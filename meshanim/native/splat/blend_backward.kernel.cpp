@@ -33,13 +33,13 @@ struct Scratch {
     int64_t stride;
 
     static int64_t floats(int64_t entries) {
-        return (entries + LANES) * (RECORD + SHAPE + 2 * LANES + VECTORS<splat::GROUP> * LANES + BLOCKS);
+        return (entries + ROOM) * (RECORD + SHAPE + 2 * PIXELS + VECTORS<splat::GROUP> * LANES + BLOCKS);
     }
-    Scratch(float *memory, int64_t entries) : stride(entries + LANES) {
+    Scratch(float *memory, int64_t entries) : stride(entries + ROOM) {
         local = memory;
         shapes = local + stride * RECORD;
         pairs = shapes + stride * SHAPE;
-        sums = pairs + stride * 2 * LANES;
+        sums = pairs + stride * 2 * PIXELS;
         lists = reinterpret_cast<int32_t *>(sums + stride * VECTORS<splat::GROUP> * LANES);
     }
 };
@@ -48,16 +48,19 @@ struct Scratch {
 class PixelGradient {
    public:
     PixelGradient(const ImageGradient &gradient, const Tile &tile) : gradient_(gradient), tile_(tile) {
-        for (int l = 0; l < LANES; ++l) offsets_[l] = int32_t(l / BLOCK_WIDTH * gradient.y + l % BLOCK_WIDTH * gradient.x);
+        for (int i = 0; i < PIXELS; ++i) offsets_[i] = int32_t(i / BLOCK * gradient.y + i % BLOCK * gradient.x);
         corner_ = gradient.data ? gradient.data + tile.image * gradient.image + tile.y * gradient.y + tile.x * gradient.x : nullptr;
     }
-    Floats at(const Block &block, int64_t channel) const {
+    Floats at(const Block &block, int part, int64_t channel) const {
         if (!corner_) return broadcast(0.0f);
         const float *corner = corner_ + block.row * gradient_.y + block.column * gradient_.x + channel * gradient_.channel;
-        if (block.row + BLOCK_HEIGHT <= tile_.height && block.column + BLOCK_WIDTH <= tile_.width) return simd::gather(corner, offsets_);
+        const int32_t *offsets = offsets_ + part * LANES;
+        if (block.row + BLOCK <= tile_.height && block.column + BLOCK <= tile_.width) return simd::gather(corner, offsets);
         float lanes[LANES] = {};
-        for (int l = 0; l < LANES; ++l)
-            if (block.row + l / BLOCK_WIDTH < tile_.height && block.column + l % BLOCK_WIDTH < tile_.width) lanes[l] = corner[offsets_[l]];
+        for (int l = 0; l < LANES; ++l) {
+            const int i = part * LANES + l;
+            if (block.row + i / BLOCK < tile_.height && block.column + i % BLOCK < tile_.width) lanes[l] = corner[offsets[l]];
+        }
         return simd::load(lanes);
     }
 
@@ -65,21 +68,21 @@ class PixelGradient {
     const ImageGradient &gradient_;
     const Tile &tile_;
     const float *corner_;
-    int32_t offsets_[LANES];
+    int32_t offsets_[PIXELS];
 };
 
-// The polynomials in (u, v) that the moments are sums of, by quads: weights[vector][row of the block] for pixels.
+// The polynomials in (u, v) that the moments are sums of: weights[block][vector][row of the block] for its four pixels.
 struct Basis {
-    float weights[BLOCKS][MOMENT_VECTORS][QUADS][LANES];
+    float weights[BLOCKS][MOMENT_VECTORS][BLOCK][LANES];
     Basis() {
         for (int b = 0; b < BLOCKS; ++b)
             for (int m = 0; m < MOMENT_VECTORS; ++m)
-                for (int row = 0; row < QUADS; ++row)
+                for (int row = 0; row < BLOCK; ++row)
                     for (int l = 0; l < LANES; ++l) {
-                        const float u = float(b % BLOCK_COLUMNS * BLOCK_WIDTH + l % 4) + 0.5f - TILE / 2;
-                        const float v = float(b / BLOCK_COLUMNS * BLOCK_HEIGHT + row) + 0.5f - TILE / 2;
+                        const float u = float(b % BLOCK_COLUMNS * BLOCK + l % BLOCK) + 0.5f - TILE / 2;
+                        const float v = float(b / BLOCK_COLUMNS * BLOCK + row) + 0.5f - TILE / 2;
                         const float values[MOMENTS] = {1, u, v, u * u, u * v, v * v};
-                        const int quantity = m * QUADS + l / 4;
+                        const int quantity = m * QUADS + l / BLOCK;
                         weights[b][m][row][l] = quantity < MOMENTS ? values[quantity] : 0;
                     }
     }
@@ -96,7 +99,7 @@ class TileGradient {
     void run() {
         const int64_t total = in_.bins.tiles[index_ + 1] - begin_;
         for (int64_t i = count_; i < total; ++i) std::memset(slot(i), 0, WIDTH * sizeof(float));
-        Floats through[CHANNELS];
+        Floats through[CHANNELS];   // light that reaches the background
         for (int j = 0; j < CHANNELS; ++j) through[j] = broadcast(0.0f);
         const bool capped = load_entries<false>(scene_, tile_, in_.records, in_.bins.entries + begin_, count_, in_.bins.count - begin_, in_.group, scratch_.local, nullptr,
                             scratch_.shapes);
@@ -121,67 +124,94 @@ class TileGradient {
     void block(int index, int count, Floats (&through)[CHANNELS]) {
         const Block &block = block_at(index);
         if (block.row >= tile_.height || block.column >= tile_.width || (count == 0 && !in_.background)) return;
-        Floats gradient[CHANNELS];
-        Floats behind = in_.group == 0 ? broadcast(0.0f) - alpha_.at(block, 0) : broadcast(0.0f);
-        for (int j = 0; j < CHANNELS; ++j) {
-            const int64_t channel = int64_t(in_.group) * splat::GROUP + j;
-            const bool color = channel < scene_.channels;
-            gradient[j] = color ? rgb_.at(block, channel) : depths_.at(block, 0);
-            if (color) behind = fma(gradient[j], broadcast(scene_.background[tile_.image * scene_.channels + channel]), behind);
+        Floats gradient[CHANNELS][PARTS], behind[PARTS], light[PARTS];
+        for (int part = 0; part < PARTS; ++part) {
+            behind[part] = in_.group == 0 ? broadcast(0.0f) - alpha_.at(block, part, 0) : broadcast(0.0f);
+            for (int j = 0; j < CHANNELS; ++j) {
+                const int64_t channel = int64_t(in_.group) * splat::GROUP + j;
+                const bool color = channel < scene_.channels;
+                gradient[j][part] = color ? rgb_.at(block, part, channel) : depths_.at(block, part, 0);
+                if (color) behind[part] = fma(gradient[j][part], broadcast(scene_.background[tile_.image * scene_.channels + channel]), behind[part]);
+            }
         }
         const int32_t *list = scratch_.lists + index * scratch_.stride;
-        const Floats light = near_to_far<CAPPED>(block, list, count);
-        for (int j = 0; j < CHANNELS; ++j) through[j] = fma(gradient[j], light, through[j]);
+        near_to_far<CAPPED>(block, list, count, light);
+        for (int j = 0; j < CHANNELS; ++j)
+            for (int part = 0; part < PARTS; ++part) through[j] = fma(gradient[j][part], light[part], through[j]);
         far_to_near<CAPPED>(index, list, count, gradient, behind);
     }
 
     // Keeps (alpha, weight) of each pair, zero where nothing was blended; cuts the list where no pixel takes more.
+    // light: what is left of it.
     template <bool CAPPED>
-    Floats near_to_far(const Block &block, const int32_t *list, int &count) {
-        const Floats u = block.u, v = block.v, most = broadcast(scene_.max_alpha), end = broadcast(splat::MIN_LIGHT), one = broadcast(1.0f);
-        Floats light = simd::select(block.inside(tile_), one, simd::negative(one));
-        float *pair = scratch_.pairs;
-        for (int i = 0; i < count; ++i, pair += 2 * LANES) {
-            const Floats alpha = visible_alpha<CAPPED>(scratch_.local + list[i], u, v, most), left = simd::fnma(light, alpha, light);
-            const Mask taken = simd::greater(left, end);
-            simd::store(pair, simd::keep(taken, alpha));
-            simd::store(pair + LANES, simd::keep(taken, alpha * light));
-            light = simd::select(taken, left, simd::negative(light));
-            if (i % 16 == 15 && !simd::any(simd::greater(light, broadcast(0.0f)))) count = i + 1;
+    void near_to_far(const Block &block, const int32_t *list, int &count, Floats (&light)[PARTS]) {
+        const Floats most = broadcast(scene_.max_alpha), end = broadcast(splat::MIN_LIGHT), one = broadcast(1.0f);
+        Floats u[PARTS], v[PARTS];
+        for (int part = 0; part < PARTS; ++part) {
+            u[part] = block.u[part], v[part] = block.v[part];
+            light[part] = simd::select(block.inside(tile_, part), one, simd::negative(one));
         }
-        return simd::magnitude(light);
+        const float *const local = scratch_.local;
+        float *pair = scratch_.pairs;
+        for (int i = 0; i < count; ++i, pair += 2 * PIXELS) {
+            Floats alpha[PARTS];
+            visible_alphas<CAPPED>(local + list[i], u, v, most, alpha);
+            for (int part = 0; part < PARTS; ++part) {
+                const Floats left = simd::fnma(light[part], alpha[part], light[part]);
+                const Mask taken = simd::greater(left, end);
+                simd::store(pair + part * LANES, simd::keep(taken, alpha[part]));
+                simd::store(pair + PIXELS + part * LANES, simd::keep(taken, alpha[part] * light[part]));
+                light[part] = simd::select(taken, left, simd::negative(light[part]));
+            }
+            if (i % 16 != 15) continue;
+            bool open = false;
+            for (const Floats &part : light) open = open || simd::any(simd::greater(part, broadcast(0.0f)));
+            if (!open) count = i + 1;
+        }
+        for (Floats &part : light) part = simd::magnitude(part);
     }
 
     // d L / d ln alpha of every pixel, zero where max_alpha acts, and at once its sums and those of the colours.
     template <bool CAPPED>
-    void far_to_near(int index, const int32_t *list, int count, const Floats (&gradient)[CHANNELS], Floats behind) {
+    void far_to_near(int index, const int32_t *list, int count, const Floats (&gradient)[CHANNELS][PARTS], Floats (&behind)[PARTS]) {
         static const Basis basis;
-        Floats shape[MOMENT_VECTORS][QUADS], paint[COLOR_VECTORS][QUADS];
+        Floats shape[MOMENT_VECTORS][BLOCK], paint[COLOR_VECTORS][BLOCK];
         for (int m = 0; m < MOMENT_VECTORS; ++m)
-            for (int row = 0; row < QUADS; ++row) shape[m][row] = simd::load(basis.weights[index][m][row]);
-        for (int m = 0; m < COLOR_VECTORS; ++m) {
-            for (int j = 0; j < QUADS; ++j) paint[m][j] = m * QUADS + j < CHANNELS ? gradient[m * QUADS + j] : broadcast(0.0f);
-            simd::transpose_quads(paint[m]);
-        }
+            for (int row = 0; row < BLOCK; ++row) shape[m][row] = simd::load(basis.weights[index][m][row]);
+        for (int m = 0; m < COLOR_VECTORS; ++m)
+            for (int part = 0; part < PARTS; ++part) {
+                Floats quads[QUADS];
+                for (int j = 0; j < QUADS; ++j) quads[j] = m * QUADS + j < CHANNELS ? gradient[m * QUADS + j][part] : broadcast(0.0f);
+                simd::transpose_quads(quads);
+                for (int j = 0; j < QUADS; ++j) paint[m][part * QUADS + j] = quads[j];
+            }
         const Floats most = broadcast(scene_.max_alpha);
+        const float *const local = scratch_.local, *pair = scratch_.pairs + int64_t(count) * 2 * PIXELS;
+        float *const all_sums = scratch_.sums;
         for (int i = count - 1; i >= 0; --i) {
-            const float *e = scratch_.local + list[i], *pair = scratch_.pairs + int64_t(i) * 2 * LANES;
-            Floats color = broadcast(e[splat::COLOR]) * gradient[0];
-            for (int j = 1; j < CHANNELS; ++j) color = fma(broadcast(e[splat::COLOR + j]), gradient[j], color);
-            const Floats alpha = simd::load(pair), weight = simd::load(pair + LANES), rise = color - behind;
-            behind = fma(alpha, rise, behind);
-            Floats change[QUADS], part[QUADS];
-            simd::spread_quads(CAPPED ? simd::keep(simd::greater(most, alpha), weight * rise) : weight * rise, change);
-            for (int row = 0; row < QUADS; ++row) part[row] = simd::load_quad(pair + LANES + 4 * row);
-            float *const sums = scratch_.sums + int64_t(list[i]) / RECORD * (VECTORS<CHANNELS> * LANES);
+            const float *const e = local + list[i];
+            pair -= 2 * PIXELS;
+            Floats change[BLOCK], weights[BLOCK];
+            for (int part = 0; part < PARTS; ++part) {
+                Floats color = broadcast(e[splat::COLOR]) * gradient[0][part];
+                for (int j = 1; j < CHANNELS; ++j) color = fma(broadcast(e[splat::COLOR + j]), gradient[j][part], color);
+                const Floats alpha = simd::load(pair + part * LANES), weight = simd::load(pair + PIXELS + part * LANES);
+                const Floats rise = color - behind[part];
+                behind[part] = fma(alpha, rise, behind[part]);
+                Floats quads[QUADS];
+                simd::spread_quads(CAPPED ? simd::keep(simd::greater(most, alpha), weight * rise) : weight * rise, quads);
+                for (int j = 0; j < QUADS; ++j) change[part * QUADS + j] = quads[j];
+            }
+            for (int row = 0; row < BLOCK; ++row) weights[row] = simd::load_quad(pair + PIXELS + BLOCK * row);
+            float *const sums = all_sums + uint32_t(list[i]) / RECORD * (VECTORS<CHANNELS> * LANES);
             for (int m = 0; m < MOMENT_VECTORS; ++m) {
                 Floats sum = simd::load(sums + m * LANES);
-                for (int row = 0; row < QUADS; ++row) sum = fma(change[row], shape[m][row], sum);
+                for (int row = 0; row < BLOCK; ++row) sum = fma(change[row], shape[m][row], sum);
                 simd::store(sums + m * LANES, sum);
             }
             for (int m = 0; m < COLOR_VECTORS; ++m) {
                 Floats sum = simd::load(sums + (MOMENT_VECTORS + m) * LANES);
-                for (int row = 0; row < QUADS; ++row) sum = fma(part[row], paint[m][row], sum);
+                for (int row = 0; row < BLOCK; ++row) sum = fma(weights[row], paint[m][row], sum);
                 simd::store(sums + (MOMENT_VECTORS + m) * LANES, sum);
             }
         }

@@ -21,6 +21,4 @@ double fused_multiply_adds(int64_t rounds, int threads, float *out) {
     return 2.0 * CHAINS * simd::LANES * double(rounds) * threads;
 }
 
-int pixels_of_block() { return simd::LANES; }
-
 }  // namespace MESHANIM_NAMESPACE

@@ -20,6 +20,13 @@ struct Palette {
     void plain(const Scene &scene, int64_t frame, int64_t first, int count) {
         const int64_t width = scene.channels;
         const float *rows = at(scene.colors, frame, first, width);
+        if (width == 3 && count == LANES) {
+            Floats columns[3];
+            simd::load_columns(rows, columns);
+            for (int j = 0; j < 3; ++j) channel[j] = columns[j];
+            channel[3] = broadcast(0.0f);
+            return;
+        }
         float columns[splat::GROUP][LANES] = {};
         for (int l = 0; l < LANES; ++l)
             for (int j = 0; j < int(width) && j < splat::GROUP; ++j) columns[j][l] = rows[(l < count ? l : count - 1) * width + j];
@@ -55,9 +62,12 @@ inline Floats trace(Floats sum, Floats value) { return fma(value, broadcast(0.0f
 
 bool colors_are_finite(const Scene &scene, int64_t frame, int64_t first, int64_t count) {
     const float *values = at(scene.colors, frame, first, scene.channels);
-    float sum = 0;
-    for (int64_t i = 0; i < count * scene.channels; ++i) sum += values[i] * 0.0f;
-    return sum == 0;
+    const int64_t size = count * scene.channels;
+    Floats sum = broadcast(0.0f);
+    int64_t i = 0;
+    for (; i + LANES <= size; i += LANES) sum = trace(sum, simd::load(values + i));
+    sum = trace(sum, simd::load_first(values + i, int(size - i)));
+    return simd::sum(sum) == 0;
 }
 
 void project_chunk(const Scene &scene, int64_t image, int64_t chunk, const splat::Projected &out) {

@@ -16,21 +16,18 @@ using splat::Scene;
 
 // Gradients of LANES items: what their slots hold, summed.
 struct Sums {
-    Floats moments[MOMENTS], color[splat::GROUP], depth;   // color: of spherical harmonics
+    Floats moments[MOMENTS], color[splat::GROUP], depth;   // color: of harmonics, or of all channels of a single group
 };
 
 class ChunkGradient {
    public:
     ChunkGradient(const Scene &scene, const ParameterGradients &out, int64_t chunk)
         : scene_(scene), out_(out), chunk_(chunk), begin_(chunk * splat::CHUNK),
-          end_(begin_ + splat::CHUNK < scene.gaussians ? begin_ + splat::CHUNK : scene.gaussians) {}
+          end_(begin_ + splat::CHUNK < scene.gaussians ? begin_ + splat::CHUNK : scene.gaussians),
+          direct_(scene.coefficients == 0 && out.n_groups == 1 && (scene.channels == 1 || scene.channels == 3 || scene.channels == 4)) {}
 
     void run() {
-        clear(out_.means, scene_.means, 3);
-        clear(out_.quaternions, scene_.quaternions, 4);
-        clear(out_.scales, scene_.scales, 3);
-        clear(out_.opacities, scene_.opacities, 1);
-        clear(out_.colors, scene_.colors, color_width());
+        if (!direct_) clear(out_.colors, scene_.colors, color_width());
         for (int64_t image = 0; image < scene_.images(); ++image) {
             const View view(scene_, image);
             for (int j = 0; j < 12; ++j) pose_[j] = broadcast(0.0f), total_[j] = 0;
@@ -50,7 +47,13 @@ class ChunkGradient {
             std::memset(data + row * field.frame + begin_ * width, 0, sizeof(float) * size_t((end_ - begin_) * width));
     }
 
-    // Returns which lanes have slots. Gradients of plain colours are done with here.
+    // Numbers of a slot that a vector of it holds.
+    static int rest(int width, int part) {
+        const int left = width - part * LANES;
+        return left < 0 ? 0 : left < LANES ? left : LANES;
+    }
+
+    // Returns which lanes have slots. Gradients of plain colours in several groups are done with here.
     uint32_t gather(int64_t image, int64_t first, int count, Sums &sums) {
         constexpr int PARTS = (MOMENTS + splat::GROUP + LANES - 1) / LANES;
         const int64_t frame = image / scene_.cameras;
@@ -63,24 +66,26 @@ class ChunkGradient {
         if (!seen) return 0;
         for (int group = 0; group < out_.n_groups; ++group) {
             const int channels = out_.channels[group], width = MOMENTS + channels;
-            Floats fields[PARTS * LANES];
-            for (int part = 0; part * LANES < width; ++part) {
-                const int rest = width - part * LANES < LANES ? width - part * LANES : LANES;
-                Floats rows[LANES];
-                for (int l = 0; l < LANES; ++l) {
-                    rows[l] = broadcast(0.0f);
-                    if (l >= count) continue;
-                    const float *slot = out_.groups[group] + int64_t(slots[l]) * width + part * LANES;
-                    for (int32_t i = slots[l]; i < slots[l + 1]; ++i, slot += width) rows[l] += simd::load_first(slot, rest);
+            Floats rows[PARTS][LANES], fields[PARTS * LANES];
+            for (int l = 0; l < LANES; ++l) {
+                Floats sum[PARTS];
+                for (Floats &part : sum) part = broadcast(0.0f);
+                if (l < count) {
+                    const float *slot = out_.groups[group] + int64_t(slots[l]) * width;
+                    for (int32_t i = slots[l]; i < slots[l + 1]; ++i, slot += width)
+                        for (int part = 0; part < PARTS; ++part) sum[part] += simd::load_first(slot + part * LANES, rest(width, part));
                 }
-                simd::transpose(rows);
-                for (int j = 0; j < LANES; ++j) fields[part * LANES + j] = rows[j];
+                for (int part = 0; part < PARTS; ++part) rows[part][l] = sum[part];
+            }
+            for (int part = 0; part < PARTS; ++part) {
+                simd::transpose(rows[part]);
+                for (int j = 0; j < LANES; ++j) fields[part * LANES + j] = rows[part][j];
             }
             for (int j = 0; j < MOMENTS; ++j) sums.moments[j] += fields[j];
             const int64_t channel = int64_t(group) * splat::GROUP;
             const int colors = scene_.channels - channel < channels ? int(scene_.channels - channel) : channels;
             if (colors < channels) sums.depth = fields[MOMENTS + colors];
-            if (scene_.coefficients)
+            if (scene_.coefficients || direct_)
                 for (int j = 0; j < colors; ++j) sums.color[j] = fields[MOMENTS + j];
             else if (out_.colors)
                 add(out_.colors + frame * scene_.colors.frame + first * scene_.channels + channel, fields + MOMENTS, colors, scene_.channels, seen, count);
@@ -94,7 +99,7 @@ class ChunkGradient {
         Sums sums;
         const uint32_t seen = gather(image, first, count, sums);
         if (out_.offsets) std::memset(out_.offsets + 2 * base, 0, 2 * sizeof(float) * size_t(count));
-        if (!seen) return;
+        if (!seen) return nothing(image, first, count);
         float lit[LANES];
         for (int l = 0; l < LANES; ++l) lit[l] = seen >> l & 1 ? 1.0f : 0.0f;
         const simd::Mask visible = simd::greater(simd::load(lit), broadcast(0.5f));
@@ -163,11 +168,16 @@ class ChunkGradient {
             for (int j = 0; j < 3; ++j) mean[j] += direction[j];
         }
         if (out_.poses) pose(view, e, in, row, camera, direction, visible);
-        write<3>(out_.means, scene_.means, mean, frame, first, seen, count);
-        write<4>(out_.quaternions, scene_.quaternions, quaternion, frame, first, seen, count);
-        write<3>(out_.scales, scene_.scales, scale, frame, first, seen, count);
+        write(out_.means, scene_.means, mean, image, first, visible, count);
+        write(out_.quaternions, scene_.quaternions, quaternion, image, first, visible, count);
+        write(out_.scales, scene_.scales, scale, image, first, visible, count);
         const Floats opacities[1] = {opacity};
-        write<1>(out_.opacities, scene_.opacities, opacities, frame, first, seen, count);
+        write(out_.opacities, scene_.opacities, opacities, image, first, visible, count);
+        if (!direct_) return;
+        const Floats colors[3] = {sums.color[0], sums.color[1], sums.color[2]}, gray[1] = {colors[0]};
+        if (scene_.channels == 1) write(out_.colors, scene_.colors, gray, image, first, visible, count);
+        else if (scene_.channels == 3) write(out_.colors, scene_.colors, colors, image, first, visible, count);
+        else write(out_.colors, scene_.colors, sums.color, image, first, visible, count);
     }
 
     // compensation^2 = sharp / determinant.
@@ -259,14 +269,40 @@ class ChunkGradient {
                 for (int j = 0; j < width; ++j) rows[l * stride + j] += values[j][l];
     }
 
+    // Whether this image is the first to write to its rows of a field; the others add.
+    bool fresh(const splat::Field &field, int64_t image) const { return field.frame ? image % scene_.cameras == 0 : image == 0; }
+
     template <int WIDTH>
-    void write(float *data, const splat::Field &field, const Floats *columns, int64_t frame, int64_t first, uint32_t seen, int count) {
-        if (data) add(data + frame * field.frame + first * WIDTH, columns, WIDTH, WIDTH, seen, count);
+    void write(float *data, const splat::Field &field, const Floats (&columns)[WIDTH], int64_t image, int64_t first, simd::Mask visible, int count) {
+        if (!data) return;
+        float *const rows = data + image / scene_.cameras * field.frame + first * WIDTH;
+        Floats sums[WIDTH];
+        if (fresh(field, image)) for (Floats &sum : sums) sum = broadcast(0.0f);
+        else load_columns(rows, count, sums);
+        for (int j = 0; j < WIDTH; ++j) sums[j] += simd::keep(visible, columns[j]);
+        if (count == LANES) return simd::store_columns(rows, sums);
+        float whole[WIDTH * LANES];
+        simd::store_columns(whole, sums);
+        std::memcpy(rows, whole, sizeof(float) * size_t(WIDTH * count));
+    }
+
+    // No item is seen: zeros where nothing has been written.
+    void nothing(int64_t image, int64_t first, int count) {
+        auto zero = [&](float *data, const splat::Field &field, int64_t width) {
+            if (data && fresh(field, image))
+                std::memset(data + image / scene_.cameras * field.frame + first * width, 0, sizeof(float) * size_t(width * count));
+        };
+        zero(out_.means, scene_.means, 3);
+        zero(out_.quaternions, scene_.quaternions, 4);
+        zero(out_.scales, scene_.scales, 3);
+        zero(out_.opacities, scene_.opacities, 1);
+        if (direct_) zero(out_.colors, scene_.colors, scene_.channels);
     }
 
     const Scene &scene_;
     const ParameterGradients &out_;
     int64_t chunk_, begin_, end_;
+    bool direct_;   // gradients of colours are written like the others
     Floats pose_[12];
     double total_[12];
 };

@@ -43,6 +43,7 @@ struct Inputs {
 
 template <int WIDTH>
 inline void load_columns(const float *rows, int count, Floats (&out)[WIDTH]) {
+    if (count == LANES) return simd::load_columns(rows, out);
     float columns[WIDTH][LANES];
     for (int l = 0; l < LANES; ++l) {
         const float *row = rows + WIDTH * (l < count ? l : count - 1);

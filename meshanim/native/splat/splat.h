@@ -11,6 +11,8 @@
 namespace splat {
 
 constexpr int TILE = 16;            // pixels
+constexpr int BLOCK = 4;            // pixels: the unit of blending
+constexpr int BLOCK_COLUMNS = TILE / BLOCK, BLOCKS = BLOCK_COLUMNS * BLOCK_COLUMNS;
 constexpr int RECORD = 16;          // floats of an item
 constexpr int GROUP = 4;            // channels that are blended at once
 constexpr int MOMENTS = 6;          // gradient sums of an entry that are about its shape
@@ -90,7 +92,7 @@ struct Bins {
 struct Forward {
     const float *records;
     Bins bins;
-    uint64_t *masks;            // (entries,) which blocks of the tile an entry reaches
+    uint16_t *masks;            // (entries,) which blocks of the tile an entry reaches
     int32_t *used;              // (tiles,) entries until no pixel of the tile takes more
     float *planes;              // (images, channels + depth + 1, height, width); alpha last
 };
@@ -104,7 +106,7 @@ struct ImageGradient {
 struct Backward {
     const float *records;
     Bins bins;
-    const uint64_t *masks;
+    const uint16_t *masks;
     const int32_t *used;
     int group, channels;        // which channels: `channels` of them from group * GROUP on
     ImageGradient rgb, alpha, depths;
