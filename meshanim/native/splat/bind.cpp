@@ -21,15 +21,15 @@
 namespace nb = nanobind;
 using namespace nb::literals;
 
-MESHANIM_DECLARE(void splat_project(const splat::Scene &, const splat::Projected &))
-MESHANIM_DECLARE(void splat_collect(const splat::Scene &, const splat::Projected &, splat::Key *, int32_t *))
-MESHANIM_DECLARE(splat::Key *splat_sort(const splat::Scene &, splat::Key *, splat::Key *, int64_t, int32_t *))
-MESHANIM_DECLARE(void splat_fill(const splat::Scene &, const splat::Key *, int64_t, const splat::Rectangle *, int32_t *,
-                                 const splat::Bins &))
-MESHANIM_DECLARE(void splat_blend(const splat::Scene &, const splat::Forward &))
+MESHANIM_DECLARE(void splat_project(const splat::Scene &, const team::Member &, const splat::Projected &))
+MESHANIM_DECLARE(void splat_collect(const splat::Scene &, const team::Member &, const splat::Projected &, splat::Key *, int32_t *))
+MESHANIM_DECLARE(splat::Key *splat_sort(const splat::Scene &, const team::Member &, const splat::Order &))
+MESHANIM_DECLARE(void splat_fill(const splat::Scene &, const team::Member &, const splat::Order &, const splat::Key *,
+                                 const splat::Rectangle *, const splat::Bins &))
+MESHANIM_DECLARE(void splat_blend(const splat::Scene &, const team::Member &, const splat::Forward &))
 MESHANIM_DECLARE(int64_t splat_scratch(int64_t entries))
-MESHANIM_DECLARE(void splat_blend_backward(const splat::Scene &, const splat::Backward &))
-MESHANIM_DECLARE(void splat_project_backward(const splat::Scene &, const splat::ParameterGradients &))
+MESHANIM_DECLARE(void splat_blend_backward(const splat::Scene &, const team::Member &, const splat::Backward &))
+MESHANIM_DECLARE(void splat_project_backward(const splat::Scene &, const team::Member &, const splat::ParameterGradients &))
 MESHANIM_DECLARE(double fused_multiply_adds(int64_t rounds, int threads, float *out))
 
 namespace {
@@ -119,7 +119,7 @@ struct State {
     static constexpr uint32_t MAGIC = 0x53504c54;
     float token = 0;   // first: what the tensor shows
     uint32_t magic = MAGIC;
-    int64_t items = 0, tiles = 0, entries = 0, longest = 0;
+    int64_t items = 0, tiles = 0, entries = 0;
     float *records = nullptr;
     splat::Bins bins{};
     uint16_t *masks = nullptr;
@@ -152,8 +152,7 @@ bool render(const Scene &scene, State &state, float *planes, int32_t *radii) {
     state.items = scene.items(), state.tiles = scene.tiles();
     const int64_t tasks = scene.images() * scene.chunks();
     splat::Projected projected{};
-    splat::Key *keys, *others;
-    int32_t *counts;
+    splat::Order order{};
     Arena scratch;
     state.of_items.reserve(state.records, state.items * splat::RECORD);
     state.of_items.reserve(state.bins.slots, state.items + 1);
@@ -165,31 +164,42 @@ bool render(const Scene &scene, State &state, float *planes, int32_t *radii) {
     scratch.reserve(projected.chunk_items, tasks);
     scratch.reserve(projected.chunk_entries, tasks);
     scratch.reserve(projected.chunk_bad, tasks);
-    scratch.reserve(keys, state.items);
-    scratch.reserve(others, state.items);
-    scratch.reserve(counts, int64_t(scene.threads) * std::max<int64_t>(state.tiles, 2048));
+    scratch.reserve(projected.chunk_least, tasks);
+    scratch.reserve(projected.chunk_most, tasks);
+    scratch.reserve(order.keys, state.items);
+    scratch.reserve(order.other, state.items);
+    scratch.reserve(order.counts, int64_t(scene.threads) * std::max<int64_t>(state.tiles, 1 << splat::DIGIT));
     scratch.allocate();
     projected.records = state.records, projected.radii = radii;
 
-    MESHANIM_DISPATCH(splat_project, scene, projected);
-    for (int64_t task = 0; task < tasks; ++task)
-        if (projected.chunk_bad[task]) return false;
-    const int64_t visible = accumulate(projected.chunk_items, tasks);
-    state.entries = accumulate(projected.chunk_entries, tasks);
-    require(state.entries < int64_t(std::numeric_limits<int32_t>::max()), "splat: the Gaussians cover too many tiles; render fewer images at once");
-    state.bins.count = state.entries;
-    state.of_entries.reserve(state.bins.entries, state.entries);
-    state.of_entries.reserve(state.masks, state.entries + 16);
-    state.of_entries.allocate();
-    MESHANIM_DISPATCH(splat_collect, scene, projected, keys, state.bins.slots);
-    state.bins.slots[state.items] = int32_t(state.entries);
-    const splat::Key *sorted = MESHANIM_DISPATCH(splat_sort, scene, keys, others, visible, counts);
-    MESHANIM_DISPATCH(splat_fill, scene, sorted, visible, projected.rectangles, counts, state.bins);
-    for (int64_t tile = 0; tile < state.tiles; ++tile)
-        state.longest = std::max<int64_t>(state.longest, state.bins.tiles[tile + 1] - state.bins.tiles[tile]);
-    const splat::Forward forward{state.records, state.bins, state.masks, state.used, planes};
-    MESHANIM_DISPATCH(splat_blend, scene, forward);
-    return true;
+    bool finite = true;
+    auto prepare = [&] {
+        for (int64_t task = 0; task < tasks; ++task) finite = finite && !projected.chunk_bad[task];
+        if (!finite) return;
+        order.count = accumulate(projected.chunk_items, tasks);
+        order.least = tasks ? *std::min_element(projected.chunk_least, projected.chunk_least + tasks) : 0;
+        order.most = tasks ? *std::max_element(projected.chunk_most, projected.chunk_most + tasks) : 0;
+        state.entries = accumulate(projected.chunk_entries, tasks);
+        require(state.entries < int64_t(std::numeric_limits<int32_t>::max()), "splat: the Gaussians cover too many tiles; render fewer images at once");
+        state.bins.count = state.entries;
+        state.of_entries.reserve(state.bins.entries, state.entries);
+        state.of_entries.reserve(state.masks, state.entries + 16);
+        state.of_entries.allocate();
+        state.bins.slots[state.items] = int32_t(state.entries);
+    };
+    team::run(scene.threads, [&](const team::Member &member) {
+        MESHANIM_DISPATCH(splat_project, scene, member, projected);
+        team::alone(member, prepare);
+        if (!finite) return;
+        MESHANIM_DISPATCH(splat_collect, scene, member, projected, order.keys, state.bins.slots);
+        team::wait(member);
+        const splat::Key *sorted = MESHANIM_DISPATCH(splat_sort, scene, member, order);
+        MESHANIM_DISPATCH(splat_fill, scene, member, order, sorted, projected.rectangles, state.bins);
+        team::wait(member);
+        const splat::Forward out{state.records, state.bins, state.masks, state.used, planes};
+        MESHANIM_DISPATCH(splat_blend, scene, member, out);
+    });
+    return finite;
 }
 
 template <class T> nb::capsule owner_of(T *pointer) {
@@ -257,18 +267,24 @@ void backward(Token token, Gradient<4> rgb, Gradient<3> alpha, Gradient<3> depth
         channels.push_back(width);
         scratch.reserve(slots[size_t(group)], state.entries * (splat::MOMENTS + width));
     }
-    in.scratch_floats = MESHANIM_DISPATCH(splat_scratch, state.longest);
+    int64_t longest = 0;
+    for (int64_t tile = 0; tile < state.tiles; ++tile)
+        longest = std::max<int64_t>(longest, state.bins.tiles[tile + 1] - state.bins.tiles[tile]);
+    in.scratch_floats = MESHANIM_DISPATCH(splat_scratch, longest);
     scratch.reserve(in.scratch, in.scratch_floats * scene.threads);
     if (to_background) scratch.reserve(in.background, state.tiles * scene.channels);
     if (to_poses) scratch.reserve(out.poses, scene.images() * scene.chunks() * 12);
     scratch.allocate();
-    for (in.group = 0; in.group < int(channels.size()); ++in.group) {
-        in.channels = channels[size_t(in.group)];
-        in.slots = slots[size_t(in.group)];
-        MESHANIM_DISPATCH(splat_blend_backward, scene, in);
-    }
     out.groups = slots.data(), out.channels = channels.data(), out.n_groups = int(channels.size());
-    MESHANIM_DISPATCH(splat_project_backward, scene, out);
+    team::run(scene.threads, [&](const team::Member &member) {
+        for (int group = 0; group < out.n_groups; ++group) {
+            splat::Backward part = in;
+            part.group = group, part.channels = channels[size_t(group)], part.slots = slots[size_t(group)];
+            MESHANIM_DISPATCH(splat_blend_backward, scene, member, part);
+            team::wait(member);
+        }
+        MESHANIM_DISPATCH(splat_project_backward, scene, member, out);
+    });
 
     const int64_t of_image = state.tiles / scene.images();
     for (int64_t image = 0; image < scene.images(); ++image) {

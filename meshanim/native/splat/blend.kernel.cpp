@@ -129,17 +129,16 @@ void blend_tile(const Scene &scene, const Forward &out, int64_t index, int group
 
 }  // namespace
 
-void splat_blend(const Scene &scene, const Forward &out) {
-    const int64_t tiles = scene.tiles();
+void splat_blend(const Scene &scene, const team::Member &member, const Forward &out) {
     for (int group = 0; group < scene.groups(); ++group) {
         const int channels = scene.width_of(group);
-#pragma omp parallel for num_threads(scene.threads) schedule(dynamic, 4)
-        for (int64_t tile = 0; tile < tiles; ++tile) {
+        if (group) team::wait(member);
+        team::take(member, scene.tiles(), 4, [&](int64_t tile) {
             if (channels == 1) blend_tile<1>(scene, out, tile, group);
             else if (channels == 2) blend_tile<2>(scene, out, tile, group);
             else if (channels == 3) blend_tile<3>(scene, out, tile, group);
             else blend_tile<4>(scene, out, tile, group);
-        }
+        });
     }
 }
 

@@ -6,10 +6,6 @@
 //     summed until the tile is done.
 #include <cstring>
 
-#ifdef _OPENMP
-#include <omp.h>
-#endif
-
 #include "isa.h"
 #include "splat.h"
 #include "tile.h"
@@ -273,21 +269,14 @@ class TileGradient {
 // Floats that a thread needs for tiles of so many entries.
 int64_t splat_scratch(int64_t entries) { return Scratch::floats(entries); }
 
-void splat_blend_backward(const Scene &scene, const Backward &in) {
-    const int64_t tiles = scene.tiles();
-    const int channels = in.channels;
-#pragma omp parallel for num_threads(scene.threads) schedule(dynamic, 4)
-    for (int64_t tile = 0; tile < tiles; ++tile) {
-#ifdef _OPENMP
-        float *const memory = in.scratch + omp_get_thread_num() * in.scratch_floats;
-#else
-        float *const memory = in.scratch;
-#endif
-        if (channels == 1) TileGradient<1>(scene, in, tile, memory).run();
-        else if (channels == 2) TileGradient<2>(scene, in, tile, memory).run();
-        else if (channels == 3) TileGradient<3>(scene, in, tile, memory).run();
+void splat_blend_backward(const Scene &scene, const team::Member &member, const Backward &in) {
+    float *const memory = in.scratch + member.rank * in.scratch_floats;
+    team::take(member, scene.tiles(), 4, [&](int64_t tile) {
+        if (in.channels == 1) TileGradient<1>(scene, in, tile, memory).run();
+        else if (in.channels == 2) TileGradient<2>(scene, in, tile, memory).run();
+        else if (in.channels == 3) TileGradient<3>(scene, in, tile, memory).run();
         else TileGradient<4>(scene, in, tile, memory).run();
-    }
+    });
 }
 
 }  // namespace MESHANIM_NAMESPACE

@@ -78,6 +78,7 @@ void project_chunk(const Scene &scene, int64_t image, int64_t chunk, const splat
     const Floats zero = broadcast(0.0f);
     Floats bad = zero;
     int64_t items = 0, entries = 0;
+    uint32_t least = 0xffffffffu, most = 0;
     for (int64_t first = begin; first < end; first += LANES) {
         const int count = int(end - first < LANES ? end - first : LANES);
         const Inputs in = load_inputs(scene, frame, first, count);
@@ -118,9 +119,9 @@ void project_chunk(const Scene &scene, int64_t image, int64_t chunk, const splat
         simd::store_rounded(x1, simd::minimum(broadcast(float(scene.columns())), one + tile(e.position[0] + extent_x + margin, scene.columns())));
         simd::store_rounded(y0, simd::maximum(zero, tile(e.position[1] - extent_y - margin, scene.rows())));
         simd::store_rounded(y1, simd::minimum(broadcast(float(scene.rows())), one + tile(e.position[1] + extent_y + margin, scene.rows())));
-        const Floats most = broadcast(1e9f);
-        simd::store_rounded(rx, simd::minimum(simd::keep(seen, radius_x), most));
-        simd::store_rounded(ry, simd::minimum(simd::keep(seen, radius_y), most));
+        const Floats limit_of_radius = broadcast(1e9f);
+        simd::store_rounded(rx, simd::minimum(simd::keep(seen, radius_x), limit_of_radius));
+        simd::store_rounded(ry, simd::minimum(simd::keep(seen, radius_y), limit_of_radius));
         float z[LANES];
         simd::store(z, e.camera[2]);
         for (int l = 0; l < count; ++l) {
@@ -131,6 +132,7 @@ void project_chunk(const Scene &scene, int64_t image, int64_t chunk, const splat
                 if (x0[l] < x1[l] && y0[l] < y1[l]) {
                     box = {uint16_t(x0[l]), uint16_t(x1[l]), uint16_t(y0[l]), uint16_t(y1[l])};
                     std::memcpy(&depth, &z[l], sizeof depth);
+                    least = depth < least ? depth : least, most = depth > most ? depth : most;
                     ++items;
                     entries += box.count();
                 }
@@ -157,15 +159,15 @@ void project_chunk(const Scene &scene, int64_t image, int64_t chunk, const splat
     const int64_t task = image * scene.chunks() + chunk;
     out.chunk_items[task] = items;
     out.chunk_entries[task] = entries;
+    out.chunk_least[task] = least, out.chunk_most[task] = most;
     out.chunk_bad[task] = !(simd::sum(bad) == 0) || !finite;
 }
 
 }  // namespace
 
-void splat_project(const Scene &scene, const splat::Projected &out) {
-    const int64_t chunks = scene.chunks(), tasks = scene.images() * chunks;
-#pragma omp parallel for num_threads(scene.threads) schedule(static)
-    for (int64_t task = 0; task < tasks; ++task) project_chunk(scene, task / chunks, task % chunks, out);
+void splat_project(const Scene &scene, const team::Member &member, const splat::Projected &out) {
+    const int64_t chunks = scene.chunks();
+    team::each(member, scene.images() * chunks, [&](int64_t task) { project_chunk(scene, task / chunks, task % chunks, out); });
 }
 
 }  // namespace MESHANIM_NAMESPACE

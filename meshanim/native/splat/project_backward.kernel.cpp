@@ -309,10 +309,8 @@ class ChunkGradient {
 
 }  // namespace
 
-void splat_project_backward(const Scene &scene, const ParameterGradients &out) {
-    const int64_t chunks = scene.chunks();
-#pragma omp parallel for num_threads(scene.threads) schedule(static)
-    for (int64_t chunk = 0; chunk < chunks; ++chunk) ChunkGradient(scene, out, chunk).run();
+void splat_project_backward(const Scene &scene, const team::Member &member, const ParameterGradients &out) {
+    team::each(member, scene.chunks(), [&](int64_t chunk) { ChunkGradient(scene, out, chunk).run(); });
 }
 
 }  // namespace MESHANIM_NAMESPACE

@@ -1,4 +1,5 @@
-// Gaussian splatting: project -> bin -> blend, and back. What the stages hand to each other.
+// Gaussian splatting: project -> bin -> blend, and back. What the stages hand to each other. A stage is called by
+// every member of a team; `team::wait` follows.
 //
 // An *item* is a Gaussian in an image: item = image * gaussians + gaussian. An *entry* is an item in a tile. Entries
 // of a tile lie together from near to far; each has a *slot* for its gradient, where the slots of an item lie
@@ -7,6 +8,8 @@
 
 #include <cstddef>
 #include <cstdint>
+
+#include "../team.h"
 
 namespace splat {
 
@@ -17,6 +20,7 @@ constexpr int RECORD = 16;          // floats of an item
 constexpr int GROUP = 4;            // channels that are blended at once
 constexpr int MOMENTS = 6;          // gradient sums of an entry that are about its shape
 constexpr int CHUNK = 1024;         // Gaussians a task of projection
+constexpr int DIGIT = 12;           // bits that a pass of sorting looks at, at most
 
 constexpr float MIN_ALPHA = 1.0f / 255.0f;
 constexpr float LOG2_MIN_ALPHA = -7.994353436858858f;
@@ -79,6 +83,15 @@ struct Projected {
     int32_t *radii;             // (items, 2)
     int64_t *chunk_items, *chunk_entries;   // (images * chunks,) how many are visible, how many tiles they touch
     uint8_t *chunk_bad;         // (images * chunks,) whether an input is not finite
+    uint32_t *chunk_least, *chunk_most;     // (images * chunks,) range of the visible items' depths
+};
+
+// What binning sorts: visible items with keys of a range. `other` is as long as `keys`.
+struct Order {
+    Key *keys, *other;
+    int64_t count;
+    uint32_t least, most;       // depths
+    int32_t *counts;            // (threads, max(tiles, 1 << DIGIT))
 };
 
 // What binning writes.
@@ -112,7 +125,7 @@ struct Backward {
     ImageGradient rgb, alpha, depths;
     float *slots;               // (entries, MOMENTS + channels)
     float *background;          // (tiles, channels), partial sums; null if not wanted
-    float *scratch;             // a thread's is `scratch_floats` long
+    float *scratch;             // a member's is `scratch_floats` long
     int64_t scratch_floats;
 };
 
