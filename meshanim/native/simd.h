@@ -156,6 +156,18 @@ inline void transpose_in_quads(Floats (&v)[4]) {
     v[2] = _mm512_castpd_ps(_mm512_unpacklo_pd(b, d)), v[3] = _mm512_castpd_ps(_mm512_unpackhi_pd(b, d));
 }
 
+// Quads of four floats at p, p + stride, ...
+inline Floats load_quads(const float *p, int64_t stride) {
+    const __m512 first = _mm512_insertf32x4(_mm512_castps128_ps512(_mm_loadu_ps(p)), _mm_loadu_ps(p + stride), 1);
+    return _mm512_insertf32x4(_mm512_insertf32x4(first, _mm_loadu_ps(p + 2 * stride), 2), _mm_loadu_ps(p + 3 * stride), 3);
+}
+// Quads of a, b and c hold four rows of three floats each; column j of them.
+inline void columns_of_quads(Floats a, Floats b, Floats c, Floats (&columns)[3]) {
+    const Floats xy = _mm512_shuffle_ps(b, c, _MM_SHUFFLE(2, 1, 3, 2)), yz = _mm512_shuffle_ps(a, b, _MM_SHUFFLE(1, 0, 2, 1));
+    columns[0] = _mm512_shuffle_ps(a, xy, _MM_SHUFFLE(2, 0, 3, 0));
+    columns[1] = _mm512_shuffle_ps(yz, xy, _MM_SHUFFLE(3, 1, 2, 0));
+    columns[2] = _mm512_shuffle_ps(yz, c, _MM_SHUFFLE(3, 0, 3, 1));
+}
 // Lane l of column j is p[3 l + j].
 inline void load_columns(const float *p, Floats (&columns)[3]) {
     struct Picks {
@@ -342,20 +354,21 @@ inline void transpose_in_quads(Floats (&v)[4]) {
     v[0] = _mm256_castpd_ps(_mm256_unpacklo_pd(a, c)), v[1] = _mm256_castpd_ps(_mm256_unpackhi_pd(a, c));
     v[2] = _mm256_castpd_ps(_mm256_unpacklo_pd(b, d)), v[3] = _mm256_castpd_ps(_mm256_unpackhi_pd(b, d));
 }
-// Quads of four floats from p and q.
-inline Floats load_quads(const float *p, const float *q) {
-    return _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(p)), _mm_loadu_ps(q), 1);
+inline Floats load_quads(const float *p, int64_t stride) {
+    return _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(p)), _mm_loadu_ps(p + stride), 1);
+}
+inline void columns_of_quads(Floats a, Floats b, Floats c, Floats (&columns)[3]) {
+    const Floats xy = _mm256_shuffle_ps(b, c, _MM_SHUFFLE(2, 1, 3, 2)), yz = _mm256_shuffle_ps(a, b, _MM_SHUFFLE(1, 0, 2, 1));
+    columns[0] = _mm256_shuffle_ps(a, xy, _MM_SHUFFLE(2, 0, 3, 0));
+    columns[1] = _mm256_shuffle_ps(yz, xy, _MM_SHUFFLE(3, 1, 2, 0));
+    columns[2] = _mm256_shuffle_ps(yz, c, _MM_SHUFFLE(3, 0, 3, 1));
 }
 inline void store_quads(float *p, float *q, Floats a) {
     _mm_storeu_ps(p, _mm256_castps256_ps128(a));
     _mm_storeu_ps(q, _mm256_extractf128_ps(a, 1));
 }
 inline void load_columns(const float *p, Floats (&columns)[3]) {
-    const Floats a = load_quads(p, p + 12), b = load_quads(p + 4, p + 16), c = load_quads(p + 8, p + 20);
-    const Floats xy = _mm256_shuffle_ps(b, c, _MM_SHUFFLE(2, 1, 3, 2)), yz = _mm256_shuffle_ps(a, b, _MM_SHUFFLE(1, 0, 2, 1));
-    columns[0] = _mm256_shuffle_ps(a, xy, _MM_SHUFFLE(2, 0, 3, 0));
-    columns[1] = _mm256_shuffle_ps(yz, xy, _MM_SHUFFLE(3, 1, 2, 0));
-    columns[2] = _mm256_shuffle_ps(yz, c, _MM_SHUFFLE(3, 0, 3, 1));
+    columns_of_quads(load_quads(p, 12), load_quads(p + 4, 12), load_quads(p + 8, 12), columns);
 }
 inline void store_columns(float *p, const Floats (&columns)[3]) {
     const Floats xy = _mm256_shuffle_ps(columns[0], columns[1], _MM_SHUFFLE(2, 0, 2, 0));
@@ -366,7 +379,7 @@ inline void store_columns(float *p, const Floats (&columns)[3]) {
     store_quads(p + 8, p + 20, _mm256_shuffle_ps(zx, yz, _MM_SHUFFLE(3, 1, 3, 1)));
 }
 inline void load_columns(const float *p, Floats (&columns)[4]) {
-    for (int j = 0; j < 4; ++j) columns[j] = load_quads(p + 4 * j, p + 16 + 4 * j);
+    for (int j = 0; j < 4; ++j) columns[j] = load_quads(p + 4 * j, 16);
     transpose_in_quads(columns);
 }
 inline void store_columns(float *p, const Floats (&columns)[4]) {
@@ -500,6 +513,11 @@ inline void transpose(Floats (&rows)[LANES]) {
 }
 inline void spread_quads(Floats a, Floats (&out)[LANES / 4]) { out[0] = a; }
 inline void transpose_quads(Floats (&)[LANES / 4]) {}
+inline Floats load_quads(const float *p, int64_t) { return load(p); }
+inline void columns_of_quads(Floats a, Floats b, Floats c, Floats (&columns)[3]) {
+    const Floats rows[3] = {a, b, c};
+    for (int j = 0; j < 3; ++j) columns[j] = each([&](int i) { return rows[(3 * i + j) / 4].lane[(3 * i + j) % 4]; });
+}
 template <int WIDTH>
 inline void load_columns(const float *p, Floats (&columns)[WIDTH]) {
     for (int j = 0; j < WIDTH; ++j) columns[j] = each([&](int i) { return p[WIDTH * i + j]; });

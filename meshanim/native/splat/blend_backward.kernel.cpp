@@ -49,9 +49,9 @@ class PixelGradient {
     }
     Floats at(const Block &block, int part, int64_t channel) const {
         if (!corner_) return broadcast(0.0f);
-        const float *corner = corner_ + block.row * gradient_.y + block.column * gradient_.x + channel * gradient_.channel;
+        const float *corner = corner_of(block) + channel * gradient_.channel;
         const int32_t *offsets = offsets_ + part * LANES;
-        if (block.row + BLOCK <= tile_.height && block.column + BLOCK <= tile_.width) return simd::gather(corner, offsets);
+        if (whole(block)) return gradient_.x == 1 ? simd::load_quads(corner + offsets[0], gradient_.y) : simd::gather(corner, offsets);
         float lanes[LANES] = {};
         for (int l = 0; l < LANES; ++l) {
             const int i = part * LANES + l;
@@ -60,7 +60,18 @@ class PixelGradient {
         return simd::load(lanes);
     }
 
+    // Whether the first three channels lie together, and `three` may read them.
+    bool together(const Block &block) const { return corner_ && gradient_.x == 3 && gradient_.channel == 1 && whole(block); }
+    void three(const Block &block, int part, Floats (&channels)[3]) const {
+        const float *row = corner_of(block) + offsets_[part * LANES];
+        simd::columns_of_quads(simd::load_quads(row, gradient_.y), simd::load_quads(row + 4, gradient_.y),
+                               simd::load_quads(row + 8, gradient_.y), channels);
+    }
+
    private:
+    bool whole(const Block &block) const { return block.row + BLOCK <= tile_.height && block.column + BLOCK <= tile_.width; }
+    const float *corner_of(const Block &block) const { return corner_ + block.row * gradient_.y + block.column * gradient_.x; }
+
     const ImageGradient &gradient_;
     const Tile &tile_;
     const float *corner_;
@@ -121,12 +132,15 @@ class TileGradient {
         const Block &block = block_at(index);
         if (block.row >= tile_.height || block.column >= tile_.width || (count == 0 && !in_.background)) return;
         Floats gradient[CHANNELS][PARTS], behind[PARTS], light[PARTS];
+        const bool three = CHANNELS >= 3 && in_.group == 0 && rgb_.together(block);
         for (int part = 0; part < PARTS; ++part) {
+            Floats rgb[3];
+            if (three) rgb_.three(block, part, rgb);
             behind[part] = in_.group == 0 ? broadcast(0.0f) - alpha_.at(block, part, 0) : broadcast(0.0f);
             for (int j = 0; j < CHANNELS; ++j) {
                 const int64_t channel = int64_t(in_.group) * splat::GROUP + j;
                 const bool color = channel < scene_.channels;
-                gradient[j][part] = color ? rgb_.at(block, part, channel) : depths_.at(block, part, 0);
+                gradient[j][part] = three && j < 3 ? rgb[j] : color ? rgb_.at(block, part, channel) : depths_.at(block, part, 0);
                 if (color) behind[part] = fma(gradient[j][part], broadcast(scene_.background[tile_.image * scene_.channels + channel]), behind[part]);
             }
         }

@@ -154,6 +154,51 @@ def test_a_batch_is_its_images_and_shared_fields_sum_their_gradients():
     torch.testing.assert_close(scene.sh.grad, total, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.parametrize("channels", [1, 2, 3, 4, 5])
+def test_colors_of_all_images_sum_their_gradients(channels, instruction_set):
+    # 37: groups of Gaussians that are not whole; most of them are out of the second camera's sight.
+    generator = torch.Generator().manual_seed(5)
+    base, views = plain(37, seed=5), cameras(33, 20, count=3)
+    views.world_to_camera[1, 2, 3] -= 4.0
+    colors = torch.rand(37, channels, generator=generator)
+    scene = leaves(Gaussians(base.means, base.quaternions, base.scales, base.opacities, colors))
+    out = rasterize(scene, views, torch.zeros(channels), depth=None)
+    weights = torch.rand(out.rgb.shape, generator=generator)
+    (out.rgb * weights).sum().backward()
+    total = {name: torch.zeros_like(getattr(scene, name)) for name in ("means", "colors")}
+    for camera in range(3):
+        single, rows = (
+            scene.map(lambda field: field.detach().clone().requires_grad_()),
+            slice(camera, camera + 1),
+        )
+        one = Cameras(views.world_to_camera[rows], views.intrinsics[rows], 33, 20)
+        (rasterize(single, one, torch.zeros(channels), depth=None).rgb[0] * weights[camera]).sum().backward()
+        for name, sum_ in total.items():
+            sum_ += getattr(single, name).grad
+    for name, sum_ in total.items():
+        torch.testing.assert_close(getattr(scene, name).grad, sum_, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_too_many_tiles_are_named(threads):
+    n, size = 70_000, 2896  # each covers all of 181 x 181 tiles
+    scene = Gaussians(
+        torch.tensor([0.0, 0.0, 2.0]).expand(n, 3),
+        torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(n, 4),
+        torch.full((n, 3), 10.0),
+        torch.full((n,), 0.5),
+        torch.zeros(n, 1),
+    )
+    k = torch.tensor([[size, 0, size / 2], [0, size, size / 2], [0, 0, 1]])
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(threads)
+        with pytest.raises(ValueError, match="too many tiles; render fewer images"):
+            rasterize(scene, Cameras(torch.eye(4)[None], k[None], size, size), torch.zeros(1), depth=None)
+    finally:
+        torch.set_num_threads(before)
+
+
 def test_two_graphs_interleaved():
     views = cameras(40, 30)
     scenes = [leaves(hard(300, seed)) for seed in (1, 2)]
