@@ -5,7 +5,7 @@ import os
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -65,18 +65,39 @@ def read_json(path: str | Path) -> Any:
     """
     try:
         return json.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except OSError as error:
+        raise FileFormatError(f"cannot read {path}: {error.strerror or error}") from error
+    except ValueError as error:
         raise FileFormatError(f"cannot read {path}: {error}") from error
 
 
-def read_npz(path: str | Path) -> dict[str, np.ndarray]:
+def read_npz(path: str | Path, needed: Sequence[str] = ()) -> dict[str, np.ndarray]:
     """The arrays of an .npz by name; nothing is unpickled.
+
+    Parameters
+    ----------
+    path : str or Path
+    needed : sequence of str
+        Names that must be there.
 
     Raises
     ------
     FileFormatError
-        If the file is missing, cut short, no .npz, or holds objects.
+        If the file is missing, cut short, no .npz, holds objects, or lacks what is needed.
     """
+    if not Path(path).exists():
+        raise FileFormatError(f"cannot read {path}: there is no such file")
+    if not zipfile.is_zipfile(path):
+        raise FileFormatError(f"cannot read {path}: it is no .npz, or cut short")
+    arrays = _arrays(path)
+    missing = [name for name in needed if name not in arrays]
+    if missing:
+        held = ", ".join(sorted(arrays)[:8]) or "nothing"
+        raise FileFormatError(f"{path} lacks {', '.join(missing)}; it holds {held}")
+    return arrays
+
+
+def _arrays(path: str | Path) -> dict[str, np.ndarray]:
     try:
         with np.load(path, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}

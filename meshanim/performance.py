@@ -400,6 +400,8 @@ def emotion_track(network: Network, options: AnimationOptions) -> EmotionTrack:
         felt = [(time, {name: by for name, by in named.items() if by}) for time, named in listed]
         return EmotionTrack.of(told_emotions(network), *felt)
     keys = _keys(options.emotion_keys)
+    if keys and options.emotion != "neutral":
+        raise OptionError("give one emotion for the speech (emotion), or emotions over time, not both")
     if isinstance(network, Audio2FaceDiffusion) and network.config.text:
         sentences = keys or [(0.0, options.emotion)]
         said = [(time, _sentence(what, options.intensity)) for time, what in sentences]

@@ -97,10 +97,15 @@ def test_bad_input_is_one_line_and_exit_2(tmp_path, capsys):
         (("emotion", tmp_path / "none.wav"), "none.wav"),
         (("emotion", tmp_path / "cut.wav"), "cut.wav"),
         (("emotion", SPEECH, "-o", tmp_path / "e.json"), ".csv"),
-        (("emotion", SPEECH, "--model", tmp_path / "none"), "no classifier"),
+        (("emotion", SPEECH, "--json", tmp_path / "none" / "e.json"), "cannot write"),
+        (("emotion", SPEECH, "--model", tmp_path / "none"), "neither a folder here nor a repository"),
         (("emotion", SPEECH, "--max-emotions", 0), "max_emotions"),
         (("emotion", SPEECH, "--enable-preferred-emotion", "--preferred", "bliss", 1), "bliss"),
         (("animate", SPEECH, "-o", tmp_path / "a.npz", "--neutral", SPEECH), "--emotion auto"),
+        (
+            ("animate", SPEECH, "-o", tmp_path / "a.npz", "--emotion", "joy", "--emotion-keys", "0:fear"),
+            "both",
+        ),
     ):
         assert run(*words) == 2, words
         error = capsys.readouterr().err

@@ -1,5 +1,6 @@
 """`Waveform`: mono samples and their rate; reading and writing sound files."""
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +17,12 @@ FULL_SCALE = 32768
 """Steps of a 16-bit sample to amplitude 1."""
 
 CONTAINERS = (".m4a", ".mp4")
+SLOWEST = 4000
+"""Samples a second of a file below which nothing of speech is left."""
+CUT = re.compile(r"(?:data|SSND) : (\d+) \(should be (\d+)\)")
+"""Where libsndfile says how many bytes of sound a wav or aiff announces, and how many there are."""
+STREAMED = 0x7FFF0000
+"""A length above this was written by a program that could not know it."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +119,7 @@ def load_waveform(path: str | Path, rate: int | None = 16000) -> Waveform:
         if path.suffix.lower() in CONTAINERS:
             samples, file_rate = _decode(path)
         else:
-            samples, file_rate = soundfile.read(path, dtype="float32", always_2d=True)
+            samples, file_rate = _read(path)
     except (soundfile.LibsndfileError, OSError) as error:
         reason = str(getattr(error, "error_string", error)).strip().rstrip(".")
         raise FileFormatError(
@@ -120,11 +127,27 @@ def load_waveform(path: str | Path, rate: int | None = 16000) -> Waveform:
         ) from error
     if len(samples) == 0:
         raise ShapeError(f"{path} holds no samples; expected at least one: record it again")
+    if file_rate < SLOWEST:
+        raise FileFormatError(
+            f"{path} has {file_rate} samples a second; expected at least {SLOWEST}: is that its true rate?"
+        )
     try:
         waveform = Waveform(samples.mean(axis=1), int(file_rate))
     except ShapeError as error:
         raise ShapeError(f"{path}: {error}") from error
     return waveform if rate is None else waveform.resampled(rate)
+
+
+def _read(path: Path) -> tuple[np.ndarray, int]:
+    """Samples (T, channels) and rate; OSError if the file ends before its sound does."""
+    with soundfile.SoundFile(path) as file:
+        cut = CUT.search(file.extra_info)
+        if cut is not None:
+            announced, there = map(int, cut.groups())
+            # Some writers count a padding byte.
+            if there + 1 < announced < STREAMED:
+                raise OSError(f"it is cut short: {there} of {announced} bytes of sound")
+        return file.read(dtype="float32", always_2d=True), file.samplerate
 
 
 def _decode(path: Path) -> tuple[np.ndarray, int]:

@@ -4,11 +4,13 @@ import importlib
 import os
 import sys
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import tyro
 
 from meshanim.errors import MeshanimError, OptionError
+from meshanim.files import check_writable
 
 __all__ = ["main"]
 
@@ -17,7 +19,7 @@ __all__ = ["main"]
 VERBS = {
     "animate": "speech in; a video, glTF, npz or contact sheet of a talking head out",
     "demo": "the same on a recorded sentence that ships with the package",
-    "train": "train a network: gava, a2f-regression, a2f-diffusion, syncnet",
+    "train": "train a network: gava, a2f-regression, a2f-diffusion, audio2emotion, syncnet",
     "evaluate": "score models and motion on held-out data, compare scores: gava, a2f, motion, ...",
     "avatar": "Gaussian avatars: fit to pictures, evaluate on held-out ones, render",
     "data": "data sets: synthesize, info, check, convert, augment-pose, personalize, ...",
@@ -25,7 +27,7 @@ VERBS = {
     "solve": "the motion of a mesh in, blendshape weights out",
     "export": "networks for other programs: onnx",
     "serve": "speech in, blendshape weights out over a network: grpc",
-    "bench": "measurements that anyone can repeat: attention, animate, binding, image-loss, realtime, solve",
+    "bench": "measurements that anyone can repeat: attention, animate, realtime, solve, splat, ...",
     "doctor": "what is installed, which backends work, how to get what is missing",
 }
 # Threads that wait by spinning slow each other down many times where other programs want the cores too.
@@ -97,8 +99,16 @@ def _call(command: Command, words: list[str], prog: str) -> int:
         options: object = tyro.cli(_options_of(command), args=words, prog=prog)
     except SystemExit as stop:  # --help, or words that do not parse; tyro has said which
         return stop.code if isinstance(stop.code, int) else 2
+    _check_results(options)
     code = command(options)
     return code if isinstance(code, int) else 0
+
+
+def _check_results(options: object) -> None:
+    """Say before long work whether results can be written; the verb itself may make its output folder."""
+    results, output = getattr(options, "json", None), getattr(options, "output", None)
+    if isinstance(results, Path) and (output is None or Path(output) not in results.parents):
+        check_writable(results)
 
 
 def _options_of(command: Command) -> type:

@@ -1,6 +1,5 @@
 """`BlendshapeTrack`: blendshape weights over time, and the files they travel in."""
 
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,7 +8,7 @@ import torch
 from jaxtyping import Float, Float32
 
 from meshanim.errors import FileFormatError, OptionError, ShapeError
-from meshanim.files import written_whole
+from meshanim.files import read_npz, written_whole
 from meshanim.heads import Head
 from meshanim.motion.blendshape_csv import (
     CsvForm,
@@ -149,10 +148,9 @@ class BlendshapeTrack:
 
 
 def _read_npz(path: Path) -> BlendshapeTrack:
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            names = tuple(str(name) for name in archive["names"])
-            weights, fps, pose = archive["weights"], float(archive["fps"]), archive["pose"]
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise FileFormatError(f"{path} holds no blendshape weights: {error}") from error
-    return BlendshapeTrack(names, weights, fps, pose)
+    arrays = read_npz(path)
+    missing = [name for name in ("names", "weights", "fps", "pose") if name not in arrays]
+    if missing:
+        raise FileFormatError(f"{path} holds no blendshape weights: it lacks {', '.join(missing)}")
+    names = tuple(str(name) for name in arrays["names"])
+    return BlendshapeTrack(names, arrays["weights"], float(arrays["fps"]), arrays["pose"])

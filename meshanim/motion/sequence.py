@@ -1,7 +1,6 @@
 """`MeshSequence`: an animated mesh with its frame rate, head pose and sound."""
 
 import math
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from torch import Tensor
 
 from meshanim.audio import Waveform
 from meshanim.errors import FileFormatError, OptionError, ShapeError
-from meshanim.files import written_whole
+from meshanim.files import read_npz, written_whole
 from meshanim.geometry import TriangleMesh
 from meshanim.heads import Head
 from meshanim.motion.pose_track import resample_rotations
@@ -132,11 +131,8 @@ class MeshSequence:
     @classmethod
     def load(cls, path: str | Path) -> "MeshSequence":
         """Read what `save` wrote; FileFormatError if a key is missing or the file is damaged."""
-        try:
-            with np.load(path) as archive:
-                arrays = {key: archive[key] for key in ("vertices", "faces", "fps", "pose")}
-                template = archive["template"] if "template" in archive else arrays["vertices"][0]
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            raise FileFormatError(f"{path} is not a mesh sequence in npz: {error}") from error
-        mesh = TriangleMesh(template, arrays["faces"])
+        arrays = read_npz(path, ("vertices", "faces", "fps", "pose"))
+        if not len(arrays["vertices"]):
+            raise FileFormatError(f"{path} holds no frames")
+        mesh = TriangleMesh(arrays.get("template", arrays["vertices"][0]), arrays["faces"])
         return cls(arrays["vertices"], float(arrays["fps"]), mesh, arrays["pose"])

@@ -94,13 +94,34 @@ def write_truncated(path):
     path.write_bytes(path.read_bytes()[:20])
 
 
-@pytest.mark.parametrize("write", [write_text, write_nothing, write_truncated])
+def write_half(path):
+    soundfile.write(path, tone(200, 16000), 16000)
+    path.write_bytes(path.read_bytes()[:16000])
+
+
+@pytest.mark.parametrize("write", [write_text, write_nothing, write_truncated, write_half])
 def test_files_that_are_no_sound(tmp_path, write):
     path = tmp_path / "speech.wav"
     write(path)
     with pytest.raises(FileFormatError, match=r"speech\.wav") as caught:
         load_waveform(path)
     assert "\n" not in str(caught.value)
+
+
+def test_wavs_of_programs_that_stream_are_read(tmp_path):
+    """They cannot know the length when they write it: all ones, or nothing."""
+    path = tmp_path / "speech.wav"
+    soundfile.write(path, tone(200, 16000), 16000)
+    whole, known = load_waveform(path).samples, path.read_bytes()
+    for length in (b"\xff\xff\xff\xff", b"\xff\xff\xff\x7f"):
+        path.write_bytes(known[:4] + length + known[8:40] + length + known[44:])
+        np.testing.assert_array_equal(load_waveform(path).samples, whole)
+
+
+def test_a_rate_that_no_speech_has(tmp_path):
+    soundfile.write(tmp_path / "speech.wav", tone(20, 16000), 100)
+    with pytest.raises(FileFormatError, match="100 samples a second; expected at least 4000"):
+        load_waveform(tmp_path / "speech.wav")
 
 
 def test_missing_file_and_folder(tmp_path):

@@ -32,8 +32,12 @@ def test_damaged_or_foreign_files_are_named(tmp_path, tetrahedron):
     np.savez(tmp_path / "other.npz", a=1)
     with pytest.raises(FileFormatError, match="vertices"):
         MeshSequence.load(tmp_path / "other.npz")
-    with pytest.raises(FileFormatError, match=r"missing\.npz"):
+    with pytest.raises(FileFormatError, match=r"missing\.npz: there is no such file"):
         MeshSequence.load(tmp_path / "missing.npz")
+    (tmp_path / "speech.wav").write_bytes(b"RIFF" + bytes(100))
+    with pytest.raises(FileFormatError, match=r"speech\.wav: it is no \.npz") as caught:
+        MeshSequence.load(tmp_path / "speech.wav")
+    assert "pickle" not in str(caught.value)
 
 
 def test_what_does_not_fit_is_refused(tetrahedron, unchecked):

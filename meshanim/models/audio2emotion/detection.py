@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 import torch
+from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
 from jaxtyping import Float, Float32, Float64
 
 from meshanim.audio import SpeechEncoder, Waveform
@@ -315,5 +316,10 @@ def load_audio2emotion(name: str | Path = "default") -> Audio2Emotion:
             path = path / "model"
     try:
         return Audio2Emotion.from_pretrained(str(path))
+    except (HfHubHTTPError, LocalEntryNotFoundError, HFValidationError) as error:
+        raise FileFormatError(
+            f"no classifier of emotions {name}: neither a folder here nor a repository of the hub that can "
+            "be reached"
+        ) from error
     except (ValueError, TypeError, OSError) as error:
         raise FileFormatError(f"no classifier of emotions {name}: {error}") from error
