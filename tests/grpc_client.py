@@ -86,7 +86,7 @@ class Answer:
     def __init__(self, answers):
         kinds = []
         self.weights, self.times, self.sound, self.status, self.names = [], [], b"", None, None
-        self.told, self.heard, self.shown = [], [], []
+        self.told, self.shown = [], []
         for answer in answers:
             kinds.append(answer.WhichOneof("stream_part"))
             if kinds[-1] == "animation_data_stream_header":
@@ -99,11 +99,14 @@ class Answer:
                 self.weights.append(list(frame.values))
                 assert answer.animation_data.audio.time_code == pytest.approx(len(self.sound) / 2 / self.rate)
                 self.sound += answer.animation_data.audio.audio_buffer
-                aggregate = messages.EmotionAggregate()
-                if answer.animation_data.metadata["emotion_aggregate"].Unpack(aggregate):
+                metadata = answer.animation_data.metadata
+                if "emotion_aggregate" in metadata:
+                    # The name that NVIDIA's sample client asks for; its package on PyPI has another.
+                    name = metadata["emotion_aggregate"].TypeName()
+                    assert name == "nvidia_ace.emotion_aggregate.v1.EmotionAggregate"
+                    aggregate = messages.EmotionAggregate.FromString(metadata["emotion_aggregate"].value)
                     for kept, given in (
                         (self.told, aggregate.input_emotions),
-                        (self.heard, aggregate.a2e_output),
                         (self.shown, aggregate.a2f_smoothed_output),
                     ):
                         kept += [(key.time_code, dict(key.emotion)) for key in given]

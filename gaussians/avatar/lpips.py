@@ -73,7 +73,8 @@ def _state(path: Path) -> dict[str, Tensor]:
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises many kinds; all of them mean that the file is no state dict
-        raise FileFormatError(f"cannot read the weights {path}: {error}") from error
+        reason = str(error) or "it is cut short"
+        raise FileFormatError(f"cannot read the weights {path}: {reason}") from error
     if not isinstance(state, dict):
         raise FileFormatError(f"{path} holds no state dict")
     return state

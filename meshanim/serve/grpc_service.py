@@ -37,6 +37,8 @@ __all__ = ["Audio2FaceService", "ServeGrpcOptions", "serve_grpc", "start_server"
 
 SERVICE = "nvidia_ace.services.a2f_controller.v1.A2FControllerService"
 HEALTH = "grpc.health.v1.Health"
+AGGREGATE = "nvidia_ace.emotion_aggregate.v1.EmotionAggregate"
+"""Name of the message by which NVIDIA's clients know it; their package on PyPI has it under another."""
 SERVING = b"\x08\x01"
 """HealthCheckResponse with status SERVING."""
 RATES = (8000, 192_000)
@@ -355,7 +357,8 @@ class _Stream:
         )
         if self.service.emotions:
             aggregate = self.emotions.aggregate(time_code + 0.5 / self.weights.fps)
-            frame.metadata["emotion_aggregate"].Pack(aggregate)
+            frame.metadata["emotion_aggregate"].type_url = f"type.googleapis.com/{AGGREGATE}"
+            frame.metadata["emotion_aggregate"].value = aggregate.SerializeToString()
         self.sent += len(sound)
         return self.service.messages.A2F3DAnimationDataStream(animation_data=frame)
 

@@ -53,7 +53,6 @@ class StreamEmotions:
         self.unknown: set[str] = set()
         self.told: list[tuple[float, dict[str, float]]] = []
         self.news: list[tuple[float, dict[str, float]]] = []
-        self.windows: list[tuple[float, dict[str, float]]] = []
         self.times: list[float] = []
         self.rows: list[Float64[np.ndarray, " emotions"]] = []
         beginning = self._mixture(header.emotion_params.beginning_emotion)
@@ -120,12 +119,6 @@ class StreamEmotions:
             samples = self.resample.resample_chunk(samples, last=last)
         begin, step = stream.frames, stream.processor.options.fixed_dt
         rows = stream.push(samples)
-        for end, probabilities in stream.found:
-            heard = stream.processor.heard(probabilities)
-            wish = (
-                None if stream.preferred is None else stream.preferred.at(np.array([end]))[0].double().numpy()
-            )
-            self.windows.append((end, self._named(stream.processor.blended(heard, wish))))
         self.times += [(begin + k + 1) * step for k in range(len(rows))]
         self.rows += list(rows)
         if self.rows:
@@ -136,23 +129,21 @@ class StreamEmotions:
         count = sum(time < seconds - KEPT for time in self.times[:-1])
         self.times, self.rows = self.times[count:], self.rows[count:]
 
-    def _named(self, strengths: Float64[np.ndarray, " emotions"]) -> dict[str, float]:
-        return dict(zip(self.known, strengths.tolist()))
-
     def aggregate(self, seconds: float) -> Any:
-        """EmotionAggregate of a frame: what was told and heard since the frame before, and what it shows."""
+        """EmotionAggregate of a frame: what was told since the frame before, and what it shows.
+
+        Its `a2e_output` stays empty: NVIDIA's sample client (2.0) fails where it is not.
+        """
         from nvidia_audio2face_3d.messages_pb2 import EmotionAggregate, EmotionWithTimeCode
 
         def keys(found: list[tuple[float, dict[str, float]]]) -> list[EmotionWithTimeCode]:
             return [EmotionWithTimeCode(time_code=time, emotion=emotion) for time, emotion in found]
 
-        shown = self._named(self.track.at(np.array([seconds]))[0].double().numpy())
+        shown = dict(zip(self.known, self.track.at(np.array([seconds]))[0].tolist()))
         answer = EmotionAggregate(
-            input_emotions=keys(self.news),
-            a2e_output=keys(self.windows),
-            a2f_smoothed_output=keys([(seconds, shown)]),
+            input_emotions=keys(self.news), a2f_smoothed_output=keys([(seconds, shown)])
         )
-        self.news, self.windows = [], []
+        self.news = []
         return answer
 
 

@@ -195,24 +195,17 @@ def test_preferred_emotions_may_change_and_only_count_where_there_are_some():
     np.testing.assert_allclose(EmotionPostProcessor(stuck).push(rows)[:, EMOTIONS.index("fear")], 0.5)
 
 
-def test_streams_follow_preferred_emotions_and_tell_what_they_hear(detector, speech):
+def test_streams_follow_preferred_emotions_over_time(detector, speech):
     options = EmotionOptions(
         enable_preferred_emotion=True, preferred_emotion_strength=1.0, emotion_strength=1.0,
         transition_smoothing=0.0, live_blend_coef=0.0,
     )  # fmt: skip
     stream = EmotionStream(detector, options)
     stream.preferred = EmotionTrack.of(EMOTIONS, (1.0, {"joy": 0.0}), (2.0, {"joy": 1.0}))
-    found, parts = [], []
-    for first in range(0, len(speech.samples), 4000):
-        parts.append(stream.push(speech.samples[first : first + 4000]))
-        found += stream.found
+    starts = range(0, len(speech.samples), 4000)
+    parts = [stream.push(speech.samples[first : first + 4000]) for first in starts]
     joy = np.concatenate(parts)[:, EMOTIONS.index("joy")]
     np.testing.assert_allclose(joy, np.clip(np.arange(len(joy)) * 0.033 - 1, 0, 1), atol=1e-6)
-    expected = detect_emotions(speech, detector)
-    times = np.array([time for time, _ in found])
-    np.testing.assert_allclose(times, expected.times[: len(times)] + 0.95)
-    np.testing.assert_allclose([row for _, row in found], expected.probabilities[: len(times)])
-    assert len(times) == 6
 
 
 def test_a_neutral_sample_is_heard(network, speech):

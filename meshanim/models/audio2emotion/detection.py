@@ -142,8 +142,6 @@ class EmotionStream:
     ----------
     preferred : EmotionTrack, optional
         Preferred emotions over time, which frames from the next one on follow instead of the options' one.
-    found : list of (float, (6,) array)
-        Windows that the last call completed: their ends, seconds, and probabilities of `HEARD_EMOTIONS`.
     """
 
     def __init__(
@@ -159,7 +157,6 @@ class EmotionStream:
         self.latest = np.eye(len(HEARD_EMOTIONS))[NEUTRAL]
         self.ended = False
         self.preferred: EmotionTrack | None = None
-        self.found: list[tuple[float, Float64[np.ndarray, " classes"]]] = []
 
     def push(self, samples: Float[np.ndarray, " samples"]) -> Float64[np.ndarray, "frames emotions"]:
         """Take the next samples, 16 kHz; give the strengths that they complete.
@@ -198,14 +195,12 @@ class EmotionStream:
         timeline, received = self.detector.timeline, self.dropped + len(self.samples)
         whole = round(timeline.window * RATE)
         parts = []
-        self.found = []
         while True:
             start, end = timeline.span(self.windows, received)
             if end - start < whole:
                 break
             parts.append(self._frames(end))
             self.latest = self.detector.probabilities(self.samples[start - self.dropped : end - self.dropped])
-            self.found.append((end / RATE, self.latest))
             self.windows += 1
         parts.append(self._frames(received))
         keep = timeline.span(self.windows, received)[0] - self.dropped

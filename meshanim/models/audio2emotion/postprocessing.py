@@ -134,32 +134,22 @@ class EmotionPostProcessor:
         frames = [self._frame(row, wish) for row, wish in zip(given, wishes, strict=True)]
         return np.stack(frames) if frames else self.state[None][:0]
 
-    def heard(self, probabilities: Float64[np.ndarray, " classes"]) -> Float64[np.ndarray, " emotions"]:
-        """The strongest classes as emotions of the face, before anything is blended or smoothed."""
-        logits = self.options.emotion_contrast * np.log(probabilities + 1e-9)
-        heard = np.exp(logits - logits.max())
-        heard = heard / heard.sum() * self.table.any(1)
-        heard[np.argsort(-heard, kind="stable")[self.options.max_emotions :]] = 0
-        return heard @ self.table
-
-    def blended(
-        self, strengths: Float64[np.ndarray, " emotions"], preferred: Float64[np.ndarray, " emotions"] | None
-    ) -> Float64[np.ndarray, " emotions"]:
-        """With the preferred emotion, where there is one and the options want it."""
-        if preferred is None or not self.options.enable_preferred_emotion:
-            return strengths
-        share = self.options.preferred_emotion_strength
-        return (1 - share) * strengths + share * preferred
-
     def _frame(
         self,
         probabilities: Float64[np.ndarray, " classes"],
         preferred: Float64[np.ndarray, " emotions"] | None,
     ) -> Float64[np.ndarray, " emotions"]:
         options = self.options
+        logits = options.emotion_contrast * np.log(probabilities + 1e-9)
+        heard = np.exp(logits - logits.max())
+        heard = heard / heard.sum() * self.table.any(1)
+        heard[np.argsort(-heard, kind="stable")[options.max_emotions :]] = 0
         blend = options.live_blend_coef
-        self.smoothed = (1 - blend) * self.heard(probabilities) + blend * self.smoothed
-        wanted = self.blended(self.smoothed, preferred)
+        self.smoothed = (1 - blend) * (heard @ self.table) + blend * self.smoothed
+        wanted = self.smoothed
+        if options.enable_preferred_emotion and preferred is not None:
+            share = options.preferred_emotion_strength
+            wanted = (1 - share) * wanted + share * preferred
         seconds = options.transition_smoothing
         step = min(options.fixed_dt / seconds, 1.0) if seconds > 0 else 1.0
         self.state = self.state + step * (wanted - self.state)
