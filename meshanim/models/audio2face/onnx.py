@@ -212,8 +212,8 @@ class DiffusionGraph(nn.Module):
                 shape = trust * x
             else:
                 parts = zip(network.parts, network.geometry)
-                shape = [layer(trust * seen[..., part.columns]) for part, layer in parts]
-                shape = torch.cat(shape, -1) * exists
+                projected = [layer(trust * seen[..., part.columns]) for part, layer in parts]
+                shape = torch.cat(projected, -1) * exists
                 shape = network.geometry_mix(shape.transpose(1, 2)).transpose(1, 2)[:, REACH:]
             time = functional.mish(network.time.weight[step.time])
             still = torch.cat([time.expand(who.shape[0], -1), who], dim=-1)
