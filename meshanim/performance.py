@@ -408,6 +408,10 @@ def emotion_track(network: Network, options: AnimationOptions) -> EmotionTrack:
         return text_track(load_text_encoder(network.config.text_encoder), *said)
     emotions = told_emotions(network)
     if keys:
+        if options.intensity != 1:
+            raise OptionError(
+                "intensity belongs to one emotion for the speech; keys have their own strengths"
+            )
         return EmotionTrack.of(emotions, *((time, _mixture(what)) for time, what in keys))
     if not 0 <= options.intensity <= 1:
         raise OptionError(f"intensity must lie within 0 to 1, not {options.intensity}")

@@ -179,6 +179,7 @@ REFUSED = [
     ("both", {"subject": "nobody"}, "nobody"),
     ("both", {"emotion_keys": ("joy",)}, "SECONDS:NAME"),
     ("both", {"emotion_keys": ("0:joy=much",)}, "joy=much"),
+    ("both", {"emotion_keys": ("0:joy=1",), "intensity": 0.5}, "their own strengths"),
     ("both", {"emotion_keys": ("nan:joy",)}, "SECONDS:NAME"),
     ("both", {"intensity": 2.0}, "intensity"),
     ("regression", {"steps": 3}, "steps"),

@@ -140,6 +140,13 @@ def test_implicit_emotions_by_clip_and_emotion(network):
         network.implicit_of(clip="b", frame=10)
 
 
+@pytest.mark.parametrize(("joy", "told"), [(0.0, "neutral"), (0.1, "neutral"), (0.6, "joy"), (1.0, "joy")])
+def test_the_implicit_emotion_is_that_of_what_is_told_most(network, joy, told):
+    emotions = EmotionTrack.of(network.config.emotions, (0.0, {"joy": joy}))
+    stream = RegressionStream(network, load_encoder("mel"), emotions=emotions)
+    torch.testing.assert_close(stream.implicit, network.implicit_of(told))
+
+
 def test_a_deployed_network_has_no_phoneme_heads_and_gives_the_same(network, tmp_path):
     lean = network.deployed()
     assert not any("heads" in name for name in lean.state_dict())

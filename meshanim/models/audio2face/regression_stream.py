@@ -33,7 +33,8 @@ class RegressionStream:
     emotions : EmotionTrack, optional
         Explicit emotions over time; neutral if not given.
     implicit : (16,), optional
-        What `implicit_of` gives; the mean of the strongest emotion's at the start if not given.
+        What `implicit_of` gives; if not given the mean of the emotion that is strongest at the start;
+        neutral has what the others leave.
     chunk : int
         Most frames computed at once.
 
@@ -67,7 +68,8 @@ class RegressionStream:
             raise OptionError(f"the track has {count} emotions, the network {len(config.emotions)}")
         if implicit is None:
             first = self.emotions.strengths[0]
-            strongest = config.emotions[int(first.argmax())] if first.max(initial=0) > 0 else "neutral"
+            told = first.max(initial=0) >= max(1 - first.sum(), 1e-6)  # what is left is neutral's
+            strongest = config.emotions[int(first.argmax())] if told else "neutral"
             implicit = model.implicit_of(strongest)
         self.implicit = implicit.to(model.device)
         self.reader = FeatureReader(encoder, config.hearing)
