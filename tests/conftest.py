@@ -6,6 +6,9 @@ from pathlib import Path
 from jaxtyping import install_import_hook
 
 os.environ["HF_HUB_OFFLINE"] = "1"  # no test talks to the network
+if "PYTEST_XDIST_WORKER" in os.environ:
+    # One thread a worker: threads that look for work take it from the other workers, up to 25 times as long.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 install_import_hook("meshanim", "shape_checks.check")
 
