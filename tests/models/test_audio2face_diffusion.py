@@ -245,7 +245,7 @@ def test_windows_heard_alone(network):
     assert (found - whole).abs().mean() / size < 0.03
     # Heard as a whole it is another thing.
     other = animate_diffusion(network, encoder, waveform)
-    assert (other - same).abs().mean() > 2 * (parts - same).abs().mean()
+    assert (other - same).abs().mean() > 2.5 * (parts - same).abs().mean()
 
 
 def test_bad_input_is_named(network, unchecked):

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import roma
 import torch
+from diffusion_runs import options, task_of
 from states_small import FPS, write_states
 
 from meshanim.audio import load_encoder
@@ -26,32 +27,6 @@ def states(tmp_path_factory):
     """Three subjects, of whom one turns her head."""
     folder = tmp_path_factory.mktemp("states")
     return write_states(folder, ("anna", "ben", "cleo"), turning=("ben",), curve_names=CURVES)
-
-
-def options(states, output, **changes):
-    defaults = {
-        "data": states,
-        "output": output,
-        "encoder": "mel",
-        "epochs": 0,
-        "width": 32,
-        "cpu": True,
-        "train": TrainConfig(steps=4, learning_rate=3e-3, log_every=1000, save_every=1000),
-    }
-    return TrainDiffusionOptions(**(defaults | changes))
-
-
-def task_of(states, monkeypatch, tmp_path, **changes):
-    """The task and the network of a run that does not run."""
-    kept = {}
-
-    class Still(training.Trainer):
-        def run(self, progress=True):
-            kept.update(task=self.task, model=self.bare, config=self.config)
-
-    monkeypatch.setattr(training, "Trainer", Still)
-    train_diffusion(options(states, tmp_path / "still", **changes), progress=False)
-    return kept["task"], kept["model"], kept["config"]
 
 
 def mean_loss(task, network, batches=24):

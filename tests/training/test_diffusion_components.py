@@ -1,13 +1,13 @@
 import pytest
 import torch
 from audio2face_small import small_actors, small_diffusion
+from diffusion_runs import options, task_of
 from states_small import write_states
 
 from meshanim.audio import load_encoder
 from meshanim.datasets.animation_states import AnimationStates
 from meshanim.errors import OptionError
 from meshanim.models.audio2face import Audio2FaceDiffusion, EmotionTrack, FrameNoise, animate_diffusion
-from meshanim.training import audio2face_diffusion as training
 from meshanim.training.audio2face_diffusion import DiffusionWeights, TrainDiffusionOptions, train_diffusion
 from meshanim.training.diffusion_components import ComponentDiffusion, upper_shapes
 from meshanim.training.trainer import TrainConfig
@@ -59,32 +59,9 @@ def test_the_upper_face_moves_as_much():
     torch.testing.assert_close(found, moved.square().mean((1, 2)), rtol=1e-4, atol=1e-6)
 
 
-def options(states, output, **changes):
-    defaults = {
-        "data": states,
-        "output": output,
-        "encoder": "mel",
-        "epochs": 0,
-        "width": 32,
-        "cpu": True,
-        "skin": "components",
-        "train": TrainConfig(steps=2, learning_rate=3e-3, log_every=1000, save_every=1000),
-    }
-    return TrainDiffusionOptions(**(defaults | changes))
-
-
 def prepared(states, monkeypatch, tmp_path, **changes):
-    """The task and the network of a run that does not run."""
-    kept = {}
-
-    class Still(training.Trainer):
-        def run(self, progress=True):
-            kept.update(task=self.task, network=self.bare)
-
-    with monkeypatch.context() as patched:
-        patched.setattr(training, "Trainer", Still)
-        train_diffusion(options(states, tmp_path / "still", **changes), progress=False)
-    return kept["task"], kept["network"]
+    """The task and the network of a run in components that does not run."""
+    return task_of(states, monkeypatch, tmp_path, **({"skin": "components"} | changes))[:2]
 
 
 def test_the_loss_is_that_of_vertices(states, monkeypatch, tmp_path):
@@ -146,6 +123,7 @@ def test_it_follows_unheard_speech_and_shows_the_emotion(states, tmp_path):
     run = options(
         states,
         tmp_path / "run",
+        skin="components",
         train=train,
         batch=6,
         segment=(20, 30),
