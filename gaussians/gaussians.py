@@ -1,7 +1,8 @@
 """`Gaussians`: what a scene of 3D Gaussians is, before anything renders, binds or fits it."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Float
@@ -82,14 +83,14 @@ class Gaussians:
         if self.sh is not None and self.sh.shape[-2] not in _HARMONICS:
             raise ShapeError(f"sh must have 1, 4, 9 or 16 coefficients, not {self.sh.shape[-2]}")
         try:
-            _together(self._batches().values())
+            self.batch_shape  # noqa: B018, it raises where the fields do not fit together
         except RuntimeError as error:
             shapes = ", ".join(f"{name} {tuple(shape)}" for name, shape in self._batches().items())
             raise ShapeError(f"batch dimensions do not fit together: {shapes}") from error
 
     def _given(self) -> dict[str, Tensor]:
-        named = {part.name: getattr(self, part.name) for part in fields(self)}
-        return {name: tensor for name, tensor in named.items() if tensor is not None}
+        named = self.__dict__
+        return {name: named[name] for name in _TRAILING if named[name] is not None}
 
     def _batches(self) -> dict[str, torch.Size]:
         return {
@@ -101,7 +102,7 @@ class Gaussians:
         """How many Gaussians there are."""
         return self.means.shape[-2]
 
-    @property
+    @cached_property
     def batch_shape(self) -> torch.Size:
         """The batch that all fields together span."""
         return _together(self._batches().values())

@@ -24,7 +24,8 @@ CHUNK = 32  # channels a pass; more do not fit a multiprocessor's shared memory
 def rasterize_cuda(
     gaussians: Gaussians,
     cameras: Cameras,
-    background: Float[Tensor, "*images channels"],
+    background: Float[Tensor, "*#images channels"],
+    images: torch.Size,
     options: RasterOptions,
     screen_offsets: Float[Tensor, "*images n 2"] | None,
 ) -> Rendering:
@@ -41,7 +42,7 @@ def rasterize_cuda(
     """
     gsplat = _gsplat(options.max_alpha)
     check_values(gaussians)
-    images = background.shape[:-1]
+    background = background.expand(*images, background.shape[-1])
     batch, count = images[:-1], len(gaussians)
 
     def whole(field: Tensor, trailing: int) -> Tensor:

@@ -83,7 +83,7 @@ def rasterize(
     backend = _choose(backend, gaussians)
     _check_cameras(gaussians, cameras)
     batch = _batch(gaussians, cameras)
-    images = (*batch, len(cameras))
+    images = torch.Size((*batch, len(cameras)))
     if 0 in images:
         raise ShapeError(f"there is no image to render in a batch of {images}")
     behind = _background(background, gaussians, images)
@@ -91,15 +91,14 @@ def rasterize(
     if screen_gradients:
         offsets = gaussians.means.new_zeros((*images, len(gaussians), 2)).requires_grad_()
     render = {"native": rasterize_native, "cuda": rasterize_cuda, "reference": rasterize_reference}[backend]
-    return render(gaussians, cameras, behind, options, offsets)
+    return render(gaussians, cameras, behind, images, options, offsets)
 
 
 def _choose(backend: str, gaussians: Gaussians) -> str:
     if backend not in BACKENDS:
         raise OptionError(f"backend {backend!r} is not one of {', '.join(BACKENDS)}")
-    device, dtype = gaussians.means.device, gaussians.means.dtype
-    fits_native = device.type == "cpu" and dtype == torch.float32
-    fits_cuda = device.type == "cuda" and dtype == torch.float32
+    means, single = gaussians.means, gaussians.means.dtype == torch.float32
+    fits_native, fits_cuda = single and means.is_cpu, single and means.is_cuda
     if backend == "auto":
         if fits_cuda:
             return "cuda"
@@ -112,7 +111,7 @@ def _choose(backend: str, gaussians: Gaussians) -> str:
     if (backend == "native" and not fits_native) or (backend == "cuda" and not fits_cuda):
         place = "the CPU" if backend == "native" else "an NVIDIA GPU"
         raise BackendError(
-            f"backend {backend!r} computes float32 on {place}, not {dtype} on {device}: "
+            f"backend {backend!r} computes float32 on {place}, not {means.dtype} on {means.device}: "
             "use backend='reference' or 'auto'"
         )
     return backend
@@ -140,16 +139,20 @@ def _check_cameras(gaussians: Gaussians, cameras: Cameras) -> None:
             )
 
 
-def _background(background: Sequence[float] | Tensor | None, gaussians: Gaussians, images: tuple) -> Tensor:
+def _background(
+    background: Sequence[float] | Tensor | None, gaussians: Gaussians, images: torch.Size
+) -> Tensor:
+    """(..., channels), which fits the images but is not expanded to them."""
     channels = 3 if gaussians.colors is None else gaussians.colors.shape[-1]
     if background is None:
-        return gaussians.means.new_zeros((*images, channels))
+        return gaussians.means.new_zeros(channels)
     behind = torch.as_tensor(background, dtype=gaussians.means.dtype, device=gaussians.means.device)
+    leading = behind.shape[:-1]
     try:
-        if behind.shape[-1] != channels:
+        if behind.shape[-1] != channels or (leading and torch.broadcast_shapes(leading, images) != images):
             raise RuntimeError
-        return behind.expand(*images, channels)
     except (RuntimeError, IndexError) as error:
         raise ShapeError(
-            f"background {tuple(behind.shape)} does not fit {channels} channels of images {images}"
+            f"background {tuple(behind.shape)} does not fit {channels} channels of images {tuple(images)}"
         ) from error
+    return behind

@@ -4,7 +4,6 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -31,8 +30,10 @@ class _Views(NamedTuple):
     """What the kernels need besides tensors."""
 
     images: torch.Size
-    coefficients: int
     cameras: int
+    gaussians: int
+    channels: int
+    coefficients: int
     width: int
     height: int
     near: float
@@ -51,7 +52,8 @@ def available() -> bool:
 def rasterize_native(
     gaussians: Gaussians,
     cameras: Cameras,
-    background: Float[Tensor, "*images channels"],
+    background: Float[Tensor, "*#images channels"],
+    images: torch.Size,
     options: RasterOptions,
     screen_offsets: Float[Tensor, "*images n 2"] | None,
 ) -> Rendering:
@@ -64,13 +66,13 @@ def rasterize_native(
     """
     if cameras.intrinsics.requires_grad and torch.is_grad_enabled():
         raise OptionError("backend 'native' has no gradients to intrinsics: use backend='reference'")
-    fields, views = _inputs(gaussians, cameras, background, options)
+    fields, views = _inputs(gaussians, cameras, background, images, options)
     if torch.is_grad_enabled() and any(
         tensor is not None and tensor.requires_grad for tensor in (*fields, screen_offsets)
     ):
         finite, rgb, alpha, depth, radii = _Rasterize.apply(*fields, screen_offsets, views)
     else:
-        finite, rgb, alpha, depth, radii, _ = _render(fields, views)
+        finite, rgb, alpha, depth, radii = _render(fields, views)[0]
     if not finite:
         check_values(gaussians)
         raise OptionError("a Gaussian's projection overflows float32: use backend='reference'")
@@ -81,17 +83,17 @@ def rasterize_native(
 
 def work(gaussians: Gaussians, cameras: Cameras) -> int:
     """How many pairs of pixel and Gaussian the kernels compute for these images, for benchmarks."""
-    background = gaussians.means.new_zeros(len(cameras), 3)
+    background = gaussians.means.new_zeros(3)
     options = RasterOptions(0.01, 1e10, 0.3, False, 0.999, None)
-    *_, state = _render(*_inputs(gaussians, cameras, background, options))
+    images = torch.Size((*gaussians.batch_shape, len(cameras)))
+    _, (*_, state) = _render(*_inputs(gaussians, cameras, background, images, options))
     return _native.splat_pairs(state)
 
 
 def _inputs(
-    gaussians: Gaussians, cameras: Cameras, background: Tensor, options: RasterOptions
+    gaussians: Gaussians, cameras: Cameras, background: Tensor, images: torch.Size, options: RasterOptions
 ) -> tuple[list[Tensor], _Views]:
-    """Tensors in the order of `_INPUTS`, without the offsets: each has the whole batch or none."""
-    images = background.shape[:-1]
+    """Means, quaternions, scales, opacities, colours, poses, intrinsics, background: whole or shared."""
     colors = gaussians.colors if gaussians.sh is None else gaussians.sh
     assert colors is not None
     of_frame = (
@@ -110,11 +112,15 @@ def _inputs(
         poses = poses.expand(*images, 4, 4)
     if intrinsics.shape[:-2] != images:
         intrinsics = intrinsics.expand(*images, 3, 3)
+    if background.numel() != math.prod(images) * background.shape[-1]:
+        background = background.expand(*images, background.shape[-1])
     fields += [poses, intrinsics, background]
     views = _Views(
         images,
-        0 if gaussians.sh is None else gaussians.sh.shape[-2],
         len(cameras),
+        len(gaussians),
+        background.shape[-1],
+        0 if gaussians.sh is None else gaussians.sh.shape[-2],
         cameras.width,
         cameras.height,
         options.near,
@@ -133,85 +139,82 @@ def _batched(field: Tensor, batch: torch.Size, dimensions: int) -> Tensor:
     return field if math.prod(own) in (1, math.prod(batch)) else field.expand(*batch, *rest)
 
 
-def _render(fields: Sequence[Tensor], views: _Views):
-    """(finite, rgb, alpha, depth or None, radii, state), outside autograd."""
-    finite, planes, radii, state = _native.splat_forward(_scene(fields, views))
-    size, channels = (views.height, views.width), fields[7].shape[-1]
-    planes, radii = planes.view(*views.images, -1, *size), radii.view(*views.images, -1, 2)
-    alpha = planes.select(-3, -1)
-    depth = planes.select(-3, channels) if views.depth else None
-    return finite, planes.narrow(-3, 0, channels).movedim(-3, -1), alpha, depth, radii, state
+def _render(fields: Sequence[Tensor], views: _Views) -> tuple[tuple, list[Tensor]]:
+    """(finite, rgb, alpha, depth or None, radii) and what backward needs, outside autograd.
+
+    Addresses go to the kernels, not arrays: to make eight of those takes as long as a small image. What is
+    returned keeps the memory that the state refers to.
+    """
+    fields = [_plain(field) for field in fields]
+    size = (*views.images, views.height, views.width)
+    rgb, alpha = _empty((*size, views.channels)), _empty(size)
+    depth = _empty(size) if views.depth else None
+    radii = torch.empty((*views.images, views.gaussians, 2), dtype=torch.int32)
+    scene = _native.SplatScene(
+        [field.data_ptr() for field in fields],
+        [field.numel() for field in fields],
+        math.prod(views.images),
+        *views[1:],
+        torch.get_num_threads(),
+    )
+    finite, state = _native.splat_forward(
+        scene, rgb.data_ptr(), alpha.data_ptr(), 0 if depth is None else depth.data_ptr(), radii.data_ptr()
+    )
+    return (finite, rgb, alpha, depth, radii), [*fields, state]
 
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx, *given):
-        *fields, offsets, views = given
-        *outputs, state = _render(fields, views)
+        *fields, _, views = given
+        outputs, kept = _render(fields, views)
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(outputs[-1])
-        ctx.save_for_backward(*fields, state)
-        ctx.batch_dimensions, ctx.offsets = (
-            len(views.images),
-            torch.Size() if offsets is None else offsets.shape,
-        )
-        return tuple(outputs)
+        ctx.save_for_backward(*kept)
+        ctx.images = views.images
+        return outputs
 
     @staticmethod
-    @once_differentiable
-    def backward(ctx, _, grad_rgb, grad_alpha, grad_depth, __):
-        *fields, state = ctx.saved_tensors
-        shapes = [*(field.shape for field in fields), ctx.offsets]
-        grads = [_empty(shape) if wanted else None for shape, wanted in zip(shapes, ctx.needs_input_grad)]
-        means, quaternions, scales, opacities, colors, poses, _, background, offsets = map(_array, grads)
-        last = ctx.batch_dimensions - 1
-        of_images = (
-            None if g is None else g.flatten(0, last).numpy() for g in (grad_rgb, grad_alpha, grad_depth)
-        )
-        _native.splat_backward(
-            state.numpy(),
-            *of_images,
-            means,
-            quaternions,
-            scales,
-            opacities,
-            colors,
-            offsets,
-            background,
-            poses,
-        )
-        return *grads, None
+    def backward(ctx, *grads):
+        return _backward_once(ctx, *grads) if torch.is_grad_enabled() else _backward(ctx, *grads)
 
 
-def _scene(fields: Sequence[Tensor], views: _Views):
-    means, quaternions, scales, opacities, colors, poses, intrinsics, background = (
-        field.detach().contiguous().numpy() for field in fields
-    )
-    n, coefficients = means.shape[-2], views.coefficients
-    return _native.SplatScene(
-        _rows(means, n, 3),
-        _rows(quaternions, n, 4),
-        _rows(scales, n, 3),
-        _rows(opacities, n),
-        _rows(colors, n, 3 * coefficients or colors.shape[-1]),
-        coefficients,
-        _rows(poses, 4, 4),
-        _rows(intrinsics, 3, 3),
-        _rows(background, background.shape[-1]),
-        *views[2:],
-        torch.get_num_threads(),
-    )
+def _backward(ctx, _, grad_rgb, grad_alpha, grad_depth, __):
+    *fields, state = ctx.saved_tensors
+    grads = [_empty_like(field) if wanted else None for field, wanted in zip(fields, ctx.needs_input_grad)]
+    *_, to_offsets, _ = ctx.needs_input_grad
+    grads.append(_empty((*ctx.images, fields[0].shape[-2], 2)) if to_offsets else None)
+    targets = [0 if grad is None else grad.data_ptr() for grad in grads]
+    del targets[_INTRINSICS]
+    of_images = [
+        None if grad is None else grad.resolve_neg().flatten(0, len(ctx.images) - 1)
+        for grad in (grad_rgb, grad_alpha, grad_depth)
+    ]
+    _native.splat_backward(state.numpy(), *map(_strided, of_images), targets)
+    return *grads, None
 
 
-def _rows(array: np.ndarray, *rest: int) -> np.ndarray:
-    """Its leading dimensions as one. Explicit, for -1 is ambiguous where there are no Gaussians."""
-    each = math.prod(rest)
-    return array.reshape(array.size // each if each else 1, *rest)
+_backward_once = once_differentiable(_backward)
+_INTRINSICS = 6  # among the fields; gradients to them are the reference's alone
 
 
-def _empty(shape: torch.Size) -> Tensor:
-    return _native.empty(shape) if math.prod(shape) >= POOLED else torch.empty(shape)
+def _plain(tensor: Tensor) -> Tensor:
+    """Its values in contiguous memory, which stays whatever becomes of the tensor."""
+    tensor = tensor.detach()
+    return tensor.resolve_neg().contiguous() if tensor.is_neg() or not tensor.is_contiguous() else tensor
 
 
-def _array(tensor: Tensor | None) -> np.ndarray | None:
-    return None if tensor is None else tensor.numpy()
+def _strided(grad: Tensor | None) -> tuple[int, ...]:
+    """Address and strides of (images, height, width[, channels])."""
+    if grad is None:
+        return (0,) * 5
+    strides = grad.stride()
+    return (grad.data_ptr(), *strides, 0) if len(strides) == 3 else (grad.data_ptr(), *strides)
+
+
+def _empty(shape: tuple[int, ...]) -> Tensor:
+    return _native.empty(shape) if math.prod(shape) >= POOLED else torch.empty(*shape)
+
+
+def _empty_like(tensor: Tensor) -> Tensor:
+    return _native.empty(tensor.shape) if tensor.numel() >= POOLED else torch.empty_like(tensor)

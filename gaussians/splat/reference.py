@@ -56,18 +56,18 @@ class Projection:
 def rasterize_reference(
     gaussians: Gaussians,
     cameras: Cameras,
-    background: Float[Tensor, "*images channels"],
+    background: Float[Tensor, "*#images channels"],
+    images: torch.Size,
     options: RasterOptions,
     screen_offsets: Float[Tensor, "*images n 2"] | None,
 ) -> Rendering:
     """`rasterize` in torch, one image after the other."""
     check_values(gaussians)
-    images = background.shape[:-1]
     scenes = _frames(gaussians, images[:-1])
     size = (*images, 4, 4)
     poses = cameras.world_to_camera.expand(size).reshape(-1, 4, 4)
     intrinsics = cameras.intrinsics.expand(*images, 3, 3).reshape(-1, 3, 3)
-    behind = background.reshape(len(poses), -1)
+    behind = background.expand(*images, background.shape[-1]).reshape(len(poses), -1)
     offsets = None if screen_offsets is None else screen_offsets.reshape(len(poses), len(gaussians), 2)
     parts = [
         _image(

@@ -533,6 +533,13 @@ inline void quad_sums(const Floats (&rows)[LANES], Floats (&out)[LANES / 4]) { o
 
 inline void load_columns(const float *p, Floats (&columns)[1]) { columns[0] = load(p); }
 inline void store_columns(float *p, const Floats (&columns)[1]) { store(p, columns[0]); }
+#if defined(__AVX2__) || defined(__AVX512F__)
+inline void store_columns(float *p, const Floats (&columns)[2]) {
+    float lanes[2][LANES];
+    for (int j = 0; j < 2; ++j) store(lanes[j], columns[j]);
+    for (int i = 0; i < 2 * LANES; ++i) p[i] = lanes[i % 2][i / 2];
+}
+#endif
 inline Floats zeros() { return broadcast(0.0f); }
 
 // Combine the lanes whose indices are equal modulo `period` (a power of two); every lane gets its result.

@@ -3,14 +3,14 @@
 // it frees the graph; its memory and all scratch come from the pool.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
-#include <nanobind/stl/optional.h>
+#include <nanobind/stl/array.h>
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <cstring>
 #include <limits>
 #include <memory>
-#include <optional>
 #include <stdexcept>
 #include <vector>
 
@@ -36,15 +36,10 @@ namespace {
 
 using splat::Scene;
 
-template <class T, class Shape> using Contiguous = nb::ndarray<T, Shape, nb::c_contig, nb::device::cpu>;
-template <int WIDTH> using Rows = Contiguous<const float, nb::shape<-1, -1, WIDTH>>;
-using Values = Contiguous<const float, nb::shape<-1, -1>>;
-using Poses = Contiguous<const float, nb::shape<-1, 4, 4>>;
-using Intrinsics = Contiguous<const float, nb::shape<-1, 3, 3>>;
-using Output = nb::ndarray<nb::pytorch, float, nb::device::cpu>;
-using Token = Contiguous<const float, nb::shape<1>>;
-using Target = std::optional<Contiguous<float, nb::c_contig>>;
-template <int DIMENSIONS> using Gradient = std::optional<nb::ndarray<const float, nb::ndim<DIMENSIONS>, nb::device::cpu>>;
+// Tensors come as addresses of contiguous float32, for an array made of each would take longer than a small image.
+// The caller keeps them, those of the inputs as long as the state.
+using Address = uint64_t;   // 0: none
+using Token = nb::ndarray<const float, nb::shape<1>, nb::c_contig, nb::device::cpu>;
 
 void require(bool condition, const char *what) {
     if (!condition) throw std::invalid_argument(what);
@@ -69,44 +64,32 @@ class Arena {
     std::unique_ptr<memory::Lease> lease_;
 };
 
-struct SceneArrays {
-    Rows<3> means;
-    Rows<4> quaternions;
-    Rows<3> scales;
-    Values opacities;
-    Contiguous<const float, nb::shape<-1, -1, -1>> colors;
-    Poses poses;
-    Intrinsics intrinsics;
-    Values background;
-};
-
-template <class Array> splat::Field field(const Array &array, const Scene &scene, int64_t width) {
-    require(int64_t(array.shape(1)) == scene.gaussians, "splat: a field has another number of Gaussians");
-    require(array.shape(0) == 1 || int64_t(array.shape(0)) == scene.frames, "splat: a field has another batch");
-    return {array.data(), array.shape(0) == 1 ? 0 : width * scene.gaussians};
-}
+enum Input { MEANS, QUATERNIONS, SCALES, OPACITIES, COLORS, POSES, INTRINSICS, BACKGROUND, INPUTS };
 
 struct SceneHandle {
-    Scene scene;
-    SceneArrays arrays;
+    Scene scene{};
 
-    SceneHandle(Rows<3> means, Rows<4> quaternions, Rows<3> scales, Values opacities,
-                Contiguous<const float, nb::shape<-1, -1, -1>> colors, int coefficients, Poses poses, Intrinsics intrinsics,
-                Values background, int64_t cameras, int width, int height, float near, float far, float eps2d,
-                float max_alpha, bool antialiased, bool depth, int threads)
-        : arrays{means, quaternions, scales, opacities, colors, poses, intrinsics, background} {
-        require(cameras > 0 && poses.shape(0) % size_t(cameras) == 0 && poses.shape(0) == intrinsics.shape(0) &&
-                    poses.shape(0) == background.shape(0),
-                "splat: cameras and background do not fit together");
+    SceneHandle(const std::array<uint64_t, INPUTS> &addresses, const std::array<int64_t, INPUTS> &sizes, int64_t images,
+                int64_t cameras, int64_t gaussians, int64_t channels, int coefficients, int width, int height, float near,
+                float far, float eps2d, float max_alpha, bool antialiased, bool depth, int threads) {
+        require(images > 0 && cameras > 0 && images % cameras == 0 && gaussians >= 0 && channels > 0, "splat: numbers must be positive");
         require(width > 0 && height > 0 && threads > 0, "splat: sizes and threads must be positive");
-        require(coefficients == 0 || int64_t(colors.shape(2)) == 3 * coefficients, "splat: harmonics have the wrong shape");
-        scene.frames = int64_t(poses.shape(0)) / cameras, scene.cameras = cameras, scene.gaussians = int64_t(means.shape(1));
+        scene.frames = images / cameras, scene.cameras = cameras, scene.gaussians = gaussians;
         scene.width = width, scene.height = height;
-        scene.channels = coefficients ? 3 : int64_t(colors.shape(2)), scene.coefficients = coefficients;
-        require(int64_t(background.shape(1)) == scene.channels, "splat: the background has another number of channels");
-        scene.means = field(means, scene, 3), scene.quaternions = field(quaternions, scene, 4), scene.scales = field(scales, scene, 3);
-        scene.opacities = field(opacities, scene, 1), scene.colors = field(colors, scene, int64_t(colors.shape(2)));
-        scene.poses = poses.data(), scene.intrinsics = intrinsics.data(), scene.background = background.data();
+        scene.channels = channels, scene.coefficients = coefficients;
+        const int64_t of_color = coefficients ? 3 * int64_t(coefficients) : channels;
+        require(coefficients == 0 || channels == 3, "splat: harmonics have three channels");
+        auto input = [&](int i) { return reinterpret_cast<const float *>(addresses[size_t(i)]); };
+        auto field = [&](int i, int64_t floats) -> splat::Field {
+            const int64_t one = floats * gaussians, size = sizes[size_t(i)];
+            require(size == one || size == one * scene.frames, "splat: a field has the wrong size");
+            return {input(i), size == one ? 0 : one};
+        };
+        scene.means = field(MEANS, 3), scene.quaternions = field(QUATERNIONS, 4), scene.scales = field(SCALES, 3);
+        scene.opacities = field(OPACITIES, 1), scene.colors = field(COLORS, of_color);
+        require(sizes[POSES] == 16 * images && sizes[INTRINSICS] == 9 * images && sizes[BACKGROUND] == channels * images,
+                "splat: cameras and background do not fit together");
+        scene.poses = input(POSES), scene.intrinsics = input(INTRINSICS), scene.background = input(BACKGROUND);
         scene.near = near, scene.far = far, scene.eps2d = eps2d, scene.max_alpha = max_alpha;
         scene.safe_level = std::log2(max_alpha) - 1e-5f;
         scene.antialiased = antialiased, scene.depth = depth, scene.threads = threads;
@@ -148,7 +131,7 @@ int64_t accumulate(int64_t *counts, int64_t size) {
 }
 
 // False if a value is not finite.
-bool render(const Scene &scene, State &state, float *planes, int32_t *radii) {
+bool render(const Scene &scene, State &state, const splat::Forward &images, int32_t *radii) {
     state.items = scene.items(), state.tiles = scene.tiles();
     const int64_t tasks = scene.images() * scene.chunks();
     splat::Projected projected{};
@@ -196,7 +179,7 @@ bool render(const Scene &scene, State &state, float *planes, int32_t *radii) {
         const splat::Key *sorted = MESHANIM_DISPATCH(splat_sort, scene, member, order);
         MESHANIM_DISPATCH(splat_fill, scene, member, order, sorted, projected.rectangles, state.bins);
         team::wait(member);
-        const splat::Forward out{state.records, state.bins, state.masks, state.used, planes};
+        const splat::Forward out{state.records, state.bins, state.masks, state.used, images.rgb, images.alpha, images.depth};
         MESHANIM_DISPATCH(splat_blend, scene, member, out);
     });
     return finite;
@@ -206,63 +189,45 @@ template <class T> nb::capsule owner_of(T *pointer) {
     return nb::capsule(pointer, [](void *p) noexcept { delete static_cast<T *>(p); });
 }
 
-nb::tuple forward(const SceneHandle &handle) {
-    const Scene &scene = handle.scene;
-    const int64_t planes_size = scene.images() * (scene.blended() + 1) * scene.height * scene.width;
-    auto planes = std::make_unique<memory::Lease>(sizeof(float) * size_t(planes_size));
-    auto radii = std::make_unique<memory::Lease>(sizeof(int32_t) * size_t(scene.items() * 2));
+template <class T> T *at(Address address) { return reinterpret_cast<T *>(address); }
+
+nb::tuple forward(const SceneHandle &handle, Address rgb, Address alpha, Address depth, Address radii) {
+    require(!handle.scene.depth == !depth, "splat: depth needs a place, or there is none");
+    splat::Forward images{};
+    images.rgb = at<float>(rgb), images.alpha = at<float>(alpha), images.depth = at<float>(depth);
     auto state = std::make_unique<State>(handle);
     bool finite;
     {
         nb::gil_scoped_release release;
-        finite = render(scene, *state, static_cast<float *>(planes->data()), static_cast<int32_t *>(radii->data()));
+        finite = render(state->handle.scene, *state, images, at<int32_t>(radii));
     }
-    const size_t shape[] = {size_t(scene.images()), size_t(scene.blended() + 1), size_t(scene.height), size_t(scene.width)};
-    const size_t radii_shape[] = {size_t(scene.images()), size_t(scene.gaussians), 2}, one[] = {1};
-    void *const planes_data = planes->data(), *const radii_data = radii->data();
+    const size_t one[] = {1};
     State *const held = state.release();
-    return nb::make_tuple(finite, Output(planes_data, 4, shape, owner_of(planes.release())),
-                          nb::ndarray<nb::pytorch, int32_t, nb::device::cpu>(radii_data, 3, radii_shape, owner_of(radii.release())),
-                          Output(&held->token, 1, one, owner_of(held)));
+    return nb::make_tuple(finite, nb::ndarray<nb::pytorch, float, nb::device::cpu>(&held->token, 1, one, owner_of(held)));
 }
 
-float *data_of(const Target &target, int64_t size) {
-    if (!target) return nullptr;
-    require(int64_t(target->size()) == size, "splat: a gradient has the wrong shape");
-    return target->data();
-}
+using Strided = std::array<int64_t, 5>;   // an image's gradient: its address (0: none), strides of image, y, x, channel
 
-void backward(Token token, Gradient<4> rgb, Gradient<3> alpha, Gradient<3> depth, Target means,
-              Target quaternions, Target scales, Target opacities, Target colors, Target offsets, Target background, Target poses) {
+splat::ImageGradient gradient_of(const Strided &g) { return {at<const float>(Address(g[0])), g[1], g[2], g[3], g[4]}; }
+
+// `targets`: gradients of the inputs but the intrinsics, in their order, then of the positions in the image.
+void backward(Token token, const Strided &rgb, const Strided &alpha, const Strided &depth, const std::array<Address, INPUTS> &targets) {
     const State &state = state_of(token);
-    const SceneHandle &handle = state.handle;
-    const Scene &scene = handle.scene;
-    auto fits = [&](const auto &gradient) {
-        return !gradient || (int64_t(gradient->shape(0)) == scene.images() && int64_t(gradient->shape(1)) == scene.height &&
-                             int64_t(gradient->shape(2)) == scene.width);
-    };
-    require(fits(rgb) && fits(alpha) && fits(depth) && (!rgb || int64_t(rgb->shape(3)) == scene.channels) && (!depth || scene.depth),
-            "splat: a gradient of an image has the wrong shape");
+    const Scene &scene = state.handle.scene;
+    require(!depth[0] || scene.depth, "splat: there is no depth whose gradient could be given");
     splat::Backward in{state.records, state.bins, state.masks, state.used};
-    if (rgb) in.rgb = {rgb->data(), rgb->stride(0), rgb->stride(1), rgb->stride(2), rgb->stride(3)};
-    if (alpha) in.alpha = {alpha->data(), alpha->stride(0), alpha->stride(1), alpha->stride(2), 0};
-    if (depth) in.depths = {depth->data(), depth->stride(0), depth->stride(1), depth->stride(2), 0};
-
+    in.rgb = gradient_of(rgb), in.alpha = gradient_of(alpha), in.depths = gradient_of(depth);
     splat::ParameterGradients out{state.bins.slots};
-    out.means = data_of(means, int64_t(handle.arrays.means.size()));
-    out.quaternions = data_of(quaternions, int64_t(handle.arrays.quaternions.size()));
-    out.scales = data_of(scales, int64_t(handle.arrays.scales.size()));
-    out.opacities = data_of(opacities, int64_t(handle.arrays.opacities.size()));
-    out.colors = data_of(colors, int64_t(handle.arrays.colors.size()));
-    out.offsets = data_of(offsets, scene.items() * 2);
-    float *const to_background = data_of(background, scene.images() * scene.channels), *const to_poses = data_of(poses, scene.images() * 16);
+    out.means = at<float>(targets[0]), out.quaternions = at<float>(targets[1]), out.scales = at<float>(targets[2]);
+    out.opacities = at<float>(targets[3]), out.colors = at<float>(targets[4]), out.offsets = at<float>(targets[7]);
+    float *const to_poses = at<float>(targets[5]), *const to_background = at<float>(targets[6]);
     nb::gil_scoped_release release;
 
     Arena scratch;
     std::vector<int> channels;
     std::vector<float *> slots(size_t(scene.groups()));
     for (int group = 0; group < scene.groups(); ++group) {
-        const int width = scene.width_of(group) - (group + 1 == scene.groups() && scene.depth && !depth);
+        const int width = scene.width_of(group) - (group + 1 == scene.groups() && scene.depth && !depth[0]);
         if (width == 0) break;   // a group of the depth alone
         channels.push_back(width);
         scratch.reserve(slots[size_t(group)], state.entries * (splat::MOMENTS + width));
@@ -315,20 +280,20 @@ int64_t pairs(Token token) {
 
 void bind_splat(nb::module_ &m) {
     nb::class_<SceneHandle>(m, "SplatScene", "Gaussians, cameras and options as the splatting kernels read them.")
-        .def(nb::init<Rows<3>, Rows<4>, Rows<3>, Values, Contiguous<const float, nb::shape<-1, -1, -1>>, int, Poses, Intrinsics, Values,
-                      int64_t, int, int, float, float, float, float, bool, bool, int>(),
-             "means"_a.noconvert(), "quaternions"_a.noconvert(), "scales"_a.noconvert(), "opacities"_a.noconvert(),
-             "colors"_a.noconvert(), "coefficients"_a, "poses"_a.noconvert(), "intrinsics"_a.noconvert(),
-             "background"_a.noconvert(), "cameras"_a, "width"_a, "height"_a, "near"_a, "far"_a, "eps2d"_a, "max_alpha"_a,
-             "antialiased"_a, "depth"_a, "threads"_a);
-    m.def("splat_forward", &forward, "scene"_a,
-          "(finite, planes (images, channels [+ depth] + alpha, height, width), radii (images, N, 2), state).");
+        .def(nb::init<const std::array<Address, INPUTS> &, const std::array<int64_t, INPUTS> &, int64_t, int64_t, int64_t, int64_t, int,
+                      int, int, float, float, float, float, bool, bool, int>(),
+             "addresses"_a, "sizes"_a, "images"_a, "cameras"_a, "gaussians"_a, "channels"_a, "coefficients"_a, "width"_a, "height"_a,
+             "near"_a, "far"_a, "eps2d"_a, "max_alpha"_a, "antialiased"_a, "depth"_a, "threads"_a,
+             "addresses, sizes: of means, quaternions, scales, opacities, colors, poses, intrinsics, background.");
+    m.def("splat_forward", &forward, "scene"_a, "rgb"_a, "alpha"_a, "depth"_a, "radii"_a,
+          "Writes images (images, height, width, channels), (images, height, width) and radii (images, N, 2); returns "
+          "(finite, state).");
     m.def("splat_pairs", &pairs, "state"_a.noconvert(), "How many pairs of pixel and Gaussian were computed.");
     m.def("fused_multiply_adds", [](int64_t rounds, int threads) {
         std::vector<float> sums(size_t(std::max(threads, 1)));
         return MESHANIM_DISPATCH(fused_multiply_adds, rounds, std::max(threads, 1), sums.data());
     }, "rounds"_a, "threads"_a, "Keep the processor busy in registers; returns the operations done, to be timed.");
-    m.def("splat_backward", &backward, "state"_a.noconvert(), "rgb"_a.none(), "alpha"_a.none(), "depth"_a.none(),
-          "means"_a.none(), "quaternions"_a.none(), "scales"_a.none(), "opacities"_a.none(), "colors"_a.none(), "offsets"_a.none(),
-          "background"_a.none(), "poses"_a.none(), "Gradients of the images to those of the parameters, written into what is given.");
+    m.def("splat_backward", &backward, "state"_a.noconvert(), "rgb"_a, "alpha"_a, "depth"_a, "targets"_a,
+          "Writes gradients of means, quaternions, scales, opacities, colors, poses, background and positions in the image, where "
+          "there is an address; the images' own come as (address, strides of image, y, x, channel).");
 }

@@ -75,17 +75,43 @@ void write_plane(const Scene &scene, const Tile &tile, float *plane, Value value
     }
 }
 
-template <int CHANNELS>
-void write_tile(const Scene &scene, const Tile &tile, int group, const State<CHANNELS> &state, float *planes) {
-    const int64_t area = int64_t(scene.width) * scene.height;
-    float *const image = planes + tile.image * (scene.blended() + 1) * area;
-    for (int j = 0; j < CHANNELS; ++j) {
-        const int64_t channel = int64_t(group) * splat::GROUP + j;
-        const Floats behind = broadcast(channel < scene.channels ? scene.background[tile.image * scene.channels + channel] : 0.0f);
-        write_plane(scene, tile, image + channel * area, [&](int b, int part) { return fma(simd::magnitude(state.light[b][part]), behind, state.color[j][b][part]); });
+// WIDTH channels of a tile, from `first` on; the channels of a pixel lie together in the image.
+template <int WIDTH, class Value>
+void write_colors(const Scene &scene, const Tile &tile, int64_t first, float *image, Value value) {
+    for (int b = 0; b < BLOCKS; ++b) {
+        const int left = b % BLOCK_COLUMNS * BLOCK, top = b / BLOCK_COLUMNS * BLOCK;
+        const int columns = tile.width - left < BLOCK ? tile.width - left : BLOCK, rows = tile.height - top < BLOCK ? tile.height - top : BLOCK;
+        if (columns <= 0) continue;
+        float pixels[PIXELS * WIDTH];
+        for (int part = 0; part < PARTS; ++part) {
+            Floats channels[WIDTH];
+            for (int j = 0; j < WIDTH; ++j) channels[j] = value(b, part, j);
+            simd::store_columns(pixels + part * LANES * WIDTH, channels);
+        }
+        for (int row = 0; row < rows; ++row) {
+            float *out = image + (int64_t(tile.y + top + row) * scene.width + tile.x + left) * scene.channels + first;
+            const float *in = pixels + row * BLOCK * WIDTH;
+            if (scene.channels == WIDTH && columns == BLOCK) std::memcpy(out, in, sizeof(float) * BLOCK * WIDTH);
+            else
+                for (int i = 0; i < columns; ++i) std::memcpy(out + i * scene.channels, in + i * WIDTH, sizeof(float) * WIDTH);
+        }
     }
+}
+
+template <int CHANNELS>
+void write_tile(const Scene &scene, const Tile &tile, int group, const State<CHANNELS> &state, const Forward &out) {
+    const int64_t area = int64_t(scene.width) * scene.height, first = int64_t(group) * splat::GROUP;
+    float *const image = out.rgb + tile.image * area * scene.channels;
+    auto over = [&](int b, int part, int j) {
+        const Floats behind = broadcast(scene.background[tile.image * scene.channels + first + j]);
+        return fma(simd::magnitude(state.light[b][part]), behind, state.color[j][b][part]);
+    };
+    const bool depth = first + CHANNELS > scene.channels;   // the last of these channels
+    if (!depth) write_colors<CHANNELS>(scene, tile, first, image, over);
+    else if constexpr (CHANNELS > 1) write_colors<CHANNELS - 1>(scene, tile, first, image, over);
+    if (depth) write_plane(scene, tile, out.depth + tile.image * area, [&](int b, int part) { return state.color[CHANNELS - 1][b][part]; });
     if (group == 0)
-        write_plane(scene, tile, image + scene.blended() * area, [&](int b, int part) { return broadcast(1.0f) - simd::magnitude(state.light[b][part]); });
+        write_plane(scene, tile, out.alpha + tile.image * area, [&](int b, int part) { return broadcast(1.0f) - simd::magnitude(state.light[b][part]); });
 }
 
 template <int CHANNELS>
@@ -124,7 +150,7 @@ void blend_tile(const Scene &scene, const Forward &out, int64_t index, int group
         }
     }
     out.used[index] = int32_t((first < end ? first : end) - begin);
-    write_tile<CHANNELS>(scene, tile, group, state, out.planes);
+    write_tile<CHANNELS>(scene, tile, group, state, out);
 }
 
 }  // namespace

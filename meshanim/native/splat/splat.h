@@ -107,7 +107,7 @@ struct Forward {
     Bins bins;
     uint16_t *masks;            // (entries,) which blocks of the tile an entry reaches
     int32_t *used;              // (tiles,) entries until no pixel of the tile takes more
-    float *planes;              // (images, channels + depth + 1, height, width); alpha last
+    float *rgb, *alpha, *depth; // (images, height, width, channels), (images, height, width); depth null if not wanted
 };
 
 // Gradients of the images: strides of (image, y, x, channel) in floats; null where there is none.

@@ -132,7 +132,8 @@ def test_the_cuda_backend_puts_gsplats_stages_together(torch_gsplat, monkeypatch
                 0.01, 1e10, 0.3, options.get("antialiased", False), 0.999, options.get("depth", "expected")
             )
             offsets = torch.zeros(2, 2, 12, 2, requires_grad=True)
-            out = cuda.rasterize_cuda(scene, views, background.expand(2, 2, 3), settings, offsets)
+            images = torch.Size((2, 2))
+            out = cuda.rasterize_cuda(scene, views, background, images, settings, offsets)
         else:
             out = rasterize(scene, views, background, screen_gradients=True, backend=backend, **options)
         (out.rgb.square().sum() + out.alpha.sum()).backward()

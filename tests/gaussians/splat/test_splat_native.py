@@ -259,6 +259,36 @@ def test_strided_fields_and_no_gradients_give_the_same_bits():
         assert torch.equal(rasterize(given, views).rgb, expected)
 
 
+def test_lazily_negated_fields_and_gradients():
+    scene, views = plain(60, seed=9), cameras(24, 20)
+    negated = torch.complex(torch.zeros(60), -scene.opacities).conj().imag
+    gradient = torch.complex(torch.zeros(1, 20, 24), torch.rand(1, 20, 24)).conj().imag
+    assert (negated.is_neg(), gradient.is_neg()) == (True, True)
+    found = []
+    for opacities, weights in ((negated, gradient), (scene.opacities, gradient.resolve_neg())):
+        means = scene.means.clone().requires_grad_()
+        out = rasterize(Gaussians(means, scene.quaternions, scene.scales, opacities, scene.colors), views)
+        found.append((out.rgb.detach(), torch.autograd.grad(out.alpha, means, weights)[0]))
+    assert all(torch.equal(a, b) for a, b in zip(*found))
+
+
+def test_images_lie_pixel_by_pixel():
+    out = rasterize(plain(20), cameras(9, 7, count=2))
+    assert all(image.is_contiguous() for image in (out.rgb, out.alpha, out.depth))
+
+
+def test_the_memory_of_fields_outlives_them():
+    scene, views = leaves(plain(5000, seed=3)), cameras(30, 20)
+    expected = torch.autograd.grad(rasterize(scene, views).rgb.square().sum(), scene.scales)[0]
+    out = rasterize(scene, views)
+    for name in FIELDS[:-1]:
+        field = getattr(scene, name)
+        field.data = torch.full_like(field, 1e6)
+    filler = [torch.full((5000, 3), 1e6) for _ in range(20)]
+    assert torch.equal(torch.autograd.grad(out.rgb.square().sum(), scene.scales)[0], expected)
+    assert len(filler) == 20
+
+
 def test_a_field_changed_before_backward_is_noticed():
     scene, views = leaves(plain(20)), cameras(9, 9)
     out = rasterize(scene, views)
