@@ -7,6 +7,8 @@ import torch
 from jaxtyping import Float32, Int, Int32
 from torch import Tensor
 
+from meshanim.operators import cpu_operator, once_differentiable
+
 try:
     from meshanim import _native
 except ImportError:  # the extension is optional; `available` says so and to_world raises BackendError
@@ -64,7 +66,7 @@ def to_world_native(
     return world_means, world_quaternions, world_scales
 
 
-@torch.library.custom_op("meshanim::bind_gaussians", mutates_args=(), device_types="cpu")
+@cpu_operator("bind_gaussians")
 def _forward(
     vertices: Tensor,
     means: Tensor,
@@ -98,13 +100,13 @@ def _empty(shape: torch.Size) -> Tensor:
     return _native.empty(shape) if shape.numel() >= 1 << 18 else torch.empty(shape, dtype=torch.float32)
 
 
-@_forward.register_fake
+@torch.library.register_fake(_forward)
 def _(vertices, means, quaternions, scales, corners, face, f_offsets, f_gaussians, v_offsets, v_corners):
     shapes = _shapes(vertices, corners, face)
     return tuple(vertices.new_empty(shape) for shape in shapes)
 
 
-@torch.library.custom_op("meshanim::bind_gaussians_backward", mutates_args=(), device_types="cpu")
+@cpu_operator("bind_gaussians_backward")
 def _backward(
     vertices: Tensor,
     means: Tensor,
@@ -145,7 +147,7 @@ def _backward(
     return grad_vertices, *grads
 
 
-@_backward.register_fake
+@torch.library.register_fake(_backward)
 def _(vertices, means, quaternions, scales, *others):
     grad_vertices = vertices.new_empty(vertices.shape if others[-1] else (0, 0, 3))
     return grad_vertices, *(tensor.new_empty(tensor.shape) for tensor in (means, quaternions, scales))
@@ -168,4 +170,5 @@ def _differentiate(
     return grad_vertices if to_vertices else None, *grads, *(None,) * 6
 
 
-_forward.register_autograd(_differentiate, setup_context=_setup)
+torch.library.register_autograd(_forward, _differentiate, setup_context=_setup)
+once_differentiable(_backward)

@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from meshanim.errors import BackendError, OptionError, ShapeError
+from meshanim.operators import cpu_operator
 
 try:
     from meshanim import _native
@@ -102,7 +103,7 @@ def _share(shape: torch.Size, mask: Tensor | None) -> float:
     return 1 / (total * shape[-1])
 
 
-@torch.library.custom_op("meshanim::image_loss", mutates_args=(), device_types="cpu")
+@cpu_operator("image_loss")
 def _fused(
     rendered: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float, keep: bool
 ) -> tuple[Tensor, Tensor]:
@@ -123,7 +124,7 @@ def _fused(
     return loss, rendered.new_empty(0) if gradient is None else gradient
 
 
-@_fused.register_fake
+@torch.library.register_fake(_fused)
 def _(rendered, target, mask, ssim_weight, keep):
     return rendered.new_empty(()), rendered.new_empty(rendered.shape if keep else 0)
 
@@ -139,7 +140,7 @@ def _backward(ctx, grad_loss, _):
     return gradient * grad_loss, None, None, None, None
 
 
-_fused.register_autograd(_backward, setup_context=_save)
+torch.library.register_autograd(_fused, _backward, setup_context=_save)
 
 
 def _reference(rendered: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float) -> Tensor:

@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from meshanim.attention.graph import MeshGraph
+from meshanim.operators import cpu_operator, once_differentiable
 
 try:
     from meshanim import _native
@@ -48,7 +49,7 @@ def _rows(tensor: Tensor) -> Tensor:
     return tensor if whole else tensor.contiguous()
 
 
-@torch.library.custom_op("meshanim::mesh_attention", mutates_args=(), device_types="cpu")
+@cpu_operator("mesh_attention")
 def _forward(
     query: Tensor,
     key: Tensor,
@@ -94,13 +95,13 @@ def _empty(shape: torch.Size) -> Tensor:
     return _native.empty(shape) if shape.numel() >= POOLED else torch.empty(shape, dtype=torch.float32)
 
 
-@_forward.register_fake
+@torch.library.register_fake(_forward)
 def _(query, key, value, order, offsets, keys, r_offsets, r_edges, r_queries, global_token, scale, keep):
     out, probabilities = _shapes(query, keys, global_token, keep)
     return query.new_empty(out), query.new_empty(probabilities)
 
 
-@torch.library.custom_op("meshanim::mesh_attention_backward", mutates_args=(), device_types="cpu")
+@cpu_operator("mesh_attention_backward")
 def _backward(
     query: Tensor,
     key: Tensor,
@@ -140,7 +141,7 @@ def _backward(
     return grads
 
 
-@_backward.register_fake
+@torch.library.register_fake(_backward)
 def _(
     query, key, value, order, offsets, keys, r_offsets, r_edges, r_queries, global_token, scale, out, p, grad
 ):
@@ -158,4 +159,5 @@ def _differentiate(ctx, grad_out: Tensor, _) -> tuple[Tensor | None, ...]:
     return *grads, *(None,) * 9
 
 
-_forward.register_autograd(_differentiate, setup_context=_setup)
+torch.library.register_autograd(_forward, _differentiate, setup_context=_setup)
+once_differentiable(_backward)

@@ -10,7 +10,6 @@ from functools import lru_cache
 import numpy as np
 import torch
 from jaxtyping import Float, Float32, Float64
-from scipy.signal import lfilter
 from torch import Tensor
 
 from meshanim.audio.waveform import Waveform
@@ -320,6 +319,8 @@ class RunningNormalization:
                 out[growing - 1] = before + (values[growing - 1] - before) / self.memory
             state = out[growing - 1]
         if growing < len(values):
+            from scipy.signal import lfilter  # slow to load, and few need it
+
             keep = 1 - 1 / self.memory
             out[growing:] = lfilter(
                 [1 / self.memory], [1, -keep], values[growing:], axis=0, zi=(keep * state)[None]

@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -23,6 +24,7 @@ from meshanim.motion.blendshape_solver import SolverOptions
 from meshanim.motion.blendshape_track import BlendshapeTrack
 from meshanim.motion.solve_sequence import arkit_only, solve_sequence
 from meshanim.render import Camera
+from meshanim.render.look import Appearance, find_person, make_appearance, person_face
 
 __all__ = [
     "COMMANDS",
@@ -36,7 +38,8 @@ __all__ = [
 ]
 
 RECORDED = (".csv", ".npz")
-ENDINGS = (".mp4", ".glb", ".npz", ".png", ".csv", *USD_ENDINGS)
+DRAWN = (".mp4", ".glb", ".png")
+ENDINGS = (*DRAWN, ".npz", ".csv", *USD_ENDINGS)
 
 
 @dataclass(frozen=True)
@@ -174,22 +177,23 @@ class Scene:
 
     def __init__(self, animator: Animator, options: AnimateOptions):
         self.animator, self.options = animator, options
-        self.appearance = None
+        self.template: np.ndarray | None = None
+        self._shape: torch.Tensor | None = None
         if isinstance(animator.head, DefaultHead):
-            from meshanim.render.look import find_person, make_appearance
-
-            self.appearance = make_appearance(
-                animator.head, find_person(options.person), skin_image=options.skin
-            )
+            shape, self.template = person_face(animator.head, find_person(options.person))
+            self._shape = torch.from_numpy(shape)[None]
         elif options.skin is not None:
             raise OptionError("--skin paints the default head only")
+        if options.skin is not None or options.output.suffix.lower() in DRAWN:
+            self.appearance  # noqa: B018, made now: what is wrong with it is said before the speech is heard
 
-    @property
-    def template(self) -> np.ndarray | None:
-        return None if self.appearance is None else self.appearance.template
-
-    def _shape(self) -> torch.Tensor | None:
-        return None if self.appearance is None else torch.from_numpy(self.appearance.shape)[None]
+    @cached_property
+    def appearance(self) -> Appearance | None:
+        """How a person on the default head looks."""
+        if not isinstance(self.animator.head, DefaultHead):
+            return None
+        person = find_person(self.options.person)
+        return make_appearance(self.animator.head, person, skin_image=self.options.skin)
 
     def recorded(self, track: BlendshapeTrack) -> MeshSequence:
         """Weights from a file on this head, with the sound that was given."""
@@ -251,7 +255,7 @@ class Scene:
         print(solved.residual.table())
 
     def _pivot(self, head: Head) -> np.ndarray:
-        return head.joints(self._shape())[0, 1].numpy()
+        return head.joints(self._shape)[0, 1].numpy()
 
     def write_glb(self, sequence: MeshSequence) -> None:
         from meshanim.export import write_glb

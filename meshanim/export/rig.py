@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-import trimesh
 
 from meshanim.errors import FileFormatError, OptionError
 from meshanim.export.gltf import write_morph_targets
@@ -44,6 +43,8 @@ def write_rig(path: str | Path, rig: Rig) -> None:
 
 
 def _write_folder(folder: Path, rig: Rig) -> None:
+    import trimesh  # slow to load, and few need it
+
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:

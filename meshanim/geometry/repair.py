@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pymeshlab
 import scipy.sparse as sp
 from jaxtyping import Float, Int
 
@@ -85,8 +84,7 @@ def repair(
     work = _Workpiece(np.where(finite[:, None], vertices, 0.0), faces[sound])
     if merge_distance is not None:
         # A zero threshold would merge nothing; this is below any two distinct positions of a head.
-        threshold = pymeshlab.PureValue(max(merge_distance, 1e-12))
-        changes["merged vertices"] = work.step("meshing_merge_close_vertices", {"threshold": threshold})[0]
+        changes["merged vertices"] = work.merge_within(max(merge_distance, 1e-12))
     changes["duplicate faces"] = work.step("meshing_remove_duplicate_faces")[1]
     if non_manifold == "remove":
         gone = work.step("meshing_repair_non_manifold_edges", {"method": "Remove Faces"})[1]
@@ -123,6 +121,8 @@ class _Workpiece:
         self._load(vertices, faces, np.arange(len(vertices)))
 
     def _load(self, vertices: np.ndarray, faces: np.ndarray, origin: np.ndarray) -> None:
+        import pymeshlab  # slow to load, and few need it
+
         self.set = pymeshlab.MeshSet(verbose=False)
         self.set.add_mesh(
             pymeshlab.Mesh(
@@ -138,6 +138,12 @@ class _Workpiece:
         self.set.apply_filter(name, **(options or {}))
         after_vertices, after_faces = self._count()
         return vertices - after_vertices, faces - after_faces
+
+    def merge_within(self, distance: float) -> int:
+        """Merge vertices that lie no farther apart; how many went."""
+        import pymeshlab
+
+        return self.step("meshing_merge_close_vertices", {"threshold": pymeshlab.PureValue(distance)})[0]
 
     def split_fans(self) -> None:
         """Give each fan of faces its own vertices."""

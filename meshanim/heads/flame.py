@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import roma
 import torch
-import trimesh
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -206,6 +205,8 @@ def _read_texture(
     path = next((folder / name for name in TEMPLATES if (folder / name).is_file()), None)
     if path is None:
         return None
+    import trimesh  # slow to load, and few need it
+
     try:
         loaded = trimesh.load(path, process=False, force="mesh")
     except (ValueError, IndexError, KeyError, AttributeError, TypeError) as error:

@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-import trimesh
 from jaxtyping import Float, Int
 
 from meshanim.errors import FileFormatError
@@ -133,6 +132,8 @@ def _read_folder(folder: Path) -> Rig:
 
 
 def _read_obj(path: Path) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
+    import trimesh  # slow to load, and few need it
+
     try:
         loaded = trimesh.load(path, process=False, maintain_order=True, force="mesh", skip_materials=True)
     except (ValueError, IndexError, KeyError, AttributeError, TypeError) as error:

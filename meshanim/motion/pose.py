@@ -5,7 +5,6 @@ import roma
 import torch
 from jaxtyping import Float
 from scipy.ndimage import correlate1d, gaussian_filter1d
-from scipy.signal import find_peaks, lfilter
 
 from meshanim.errors import OptionError, ShapeError
 
@@ -74,6 +73,8 @@ def prosodic_accents(
     """
     if pitch is not None and pitch.shape != loudness.shape:
         raise ShapeError(f"loudness has {len(loudness)} values and pitch {len(pitch)}: they must be aligned")
+    from scipy.signal import find_peaks  # slow to load, and few need it
+
     if len(loudness) < 3:
         return np.zeros(0), np.zeros(0)
     prominence = _contour(relative_loudness(loudness), rate, 0.045)
@@ -89,6 +90,8 @@ def wander(
     samples: int, deviation: float, time_constant: float, generator: np.random.Generator
 ) -> Float[np.ndarray, " samples"]:
     """Ornstein-Uhlenbeck noise at `CONTROL_RATE`, stationary from the first sample, low-passed at 0.1 s."""
+    from scipy.signal import lfilter  # slow to load, and few need it
+
     lead = round(CONTROL_RATE)
     keep = np.exp(-1 / (CONTROL_RATE * time_constant))
     noise = generator.normal(size=lead + samples)

@@ -1,6 +1,6 @@
 """The procedural look of the default head: skin, eyes, teeth, hair, wrinkles, and a dozen people."""
 
-from meshanim.render.look.appearance import SKIN_CHANNELS, Appearance, make_appearance
+from meshanim.render.look.appearance import SKIN_CHANNELS, Appearance, make_appearance, person_face
 from meshanim.render.look.assets import LookAssets, look_assets
 from meshanim.render.look.eyes import Eye, EyeMaterial, eye_mesh, pose_eye
 from meshanim.render.look.people import PEOPLE, find_person
@@ -26,6 +26,7 @@ __all__ = [
     "find_person",
     "look_assets",
     "make_appearance",
+    "person_face",
     "pose_eye",
     "pose_teeth",
     "strand_points",

@@ -115,8 +115,7 @@ def make_appearance(
         If the head knows no such identity, or the person has more shape coefficients than the head.
     """
     assets = look_assets(head, size) if assets is None else assets
-    shape = _shape(head, person)
-    template = _template(head, person, shape)
+    shape, template = person_face(head, person)
     on_skin = assets.skin.vertices(template)
     paint = paint_skin(assets.atlas, person)
     if skin_image is not None:
@@ -162,6 +161,20 @@ def make_appearance(
         _mouth_front(on_skin),
         np.ascontiguousarray(loop, np.float32),
     )
+
+
+def person_face(
+    head: DefaultHead, person: PersonParameters
+) -> tuple[Float[np.ndarray, " shape"], Float[np.ndarray, "head_vertices 3"]]:
+    """A person's shape coefficients, all the head has, and resting vertices in metres, without the look.
+
+    Raises
+    ------
+    OptionError
+        If the head knows no such identity, or the person has more shape coefficients than the head.
+    """
+    shape = _shape(head, person)
+    return shape, _template(head, person, shape)
 
 
 def _shape(head: DefaultHead, person: PersonParameters) -> Float[np.ndarray, " shape"]:
