@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import trimesh
 from jaxtyping import Float32
 
 from meshanim.audio import Waveform, load_waveform, save_waveform
@@ -122,6 +121,8 @@ def write_faceformer_topology(directory: str | Path, mesh: TriangleMesh) -> None
     """Write templates/FLAME_sample.ply or BIWI_topology.ply, another name for other topologies."""
     folder = Path(directory) / "templates"
     folder.mkdir(parents=True, exist_ok=True)
+    import trimesh  # slow to load, and few need it
+
     written = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     with written_whole(folder / TOPOLOGY_FILES.get(mesh.n_vertices, "topology.ply")) as temporary:
         written.export(temporary)

@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-import trimesh
 from jaxtyping import Float32
 
 from meshanim.errors import FileFormatError
@@ -32,6 +31,8 @@ def load_mesh(path: str | Path, vertices: int | None = None, scale: float = 1.0)
     path = Path(path)
     if not path.is_file():
         raise FileFormatError(f"{path} is no file; expected a mesh")
+    import trimesh  # slow to load, and few need it
+
     try:
         loaded = trimesh.load(path, process=False, maintain_order=True, force="mesh", skip_materials=True)
     except Exception as error:  # trimesh's readers raise whatever their parsers do

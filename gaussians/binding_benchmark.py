@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import trimesh
 
 from meshanim.gaussians.binding import bind
 from meshanim.gaussians.gaussians import Gaussians
@@ -42,6 +41,8 @@ def run(options: BindingBenchmark | None = None) -> Results:
     options = options or BindingBenchmark()
     results = Results("binding")
     rings = max(3, round((options.faces / 4) ** 0.5))
+    import trimesh  # slow to load, and few need it
+
     made = trimesh.creation.uv_sphere(0.1, count=[rings, rings])
     mesh = TriangleMesh(np.array(made.vertices), np.array(made.faces))
     binding = bind(mesh, options.per_face)

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
-from torchmetrics.functional.image import structural_similarity_index_measure
 
 from meshanim.gaussians.losses import image_loss
 from meshanim.results import Results
@@ -45,6 +44,8 @@ def run(options: LossBenchmark | None = None) -> Results:
 
 
 def _compare(case: str, rendered: Tensor, target: Tensor, repeats: int, results: Results) -> None:
+    from torchmetrics.functional.image import structural_similarity_index_measure  # loads transformers
+
     planes = target.movedim(-1, 1).contiguous()
 
     def generic() -> Tensor:

@@ -23,6 +23,18 @@ def test_datasets_install_inside_the_package():
     subprocess.run([sys.executable, "-c", code], check=True, cwd="/")
 
 
+def test_a_start_loads_nothing_that_is_slow_and_seldom_needed():
+    code = """
+import sys, numpy as np, torch, meshanim.gaussians
+from meshanim.attention import MeshGraph, mesh_attention
+from meshanim.cli import animate, avatar
+mesh_attention(*torch.rand(3, 1, 4, 1, 4), MeshGraph.from_faces(np.array([[0, 1, 2]])))
+print(*{"torch._dynamo", "trimesh", "pymeshlab", "scipy.signal", "transformers"} & set(sys.modules))
+"""
+    run = subprocess.run([sys.executable, "-c", code], check=True, cwd="/", capture_output=True, text=True)
+    assert run.stdout.strip() == ""
+
+
 def test_written_whole_leaves_nothing_behind(tmp_path):
     target = tmp_path / "out.bin"
     with pytest.raises(ZeroDivisionError), written_whole(target) as temporary:

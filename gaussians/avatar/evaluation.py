@@ -13,7 +13,6 @@ from PIL import Image
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor
-from torchmetrics.functional.image import structural_similarity_index_measure
 from tqdm import tqdm
 from tyro.conf import Positional
 
@@ -205,6 +204,8 @@ def _scores(
 ) -> dict[str, float]:
     square = (rendered - truth).square().mean(-1)
     first, second = (image.movedim(-1, 0)[None] for image in (rendered, truth))
+    from torchmetrics.functional.image import structural_similarity_index_measure  # loads transformers
+
     _, similar = structural_similarity_index_measure(first, second, data_range=1.0, return_full_image=True)
     similar = similar[0].mean(0)
     scores = {}
