@@ -30,6 +30,6 @@ def once_differentiable(operator: OpOverload) -> None:
     """Refuse to differentiate an operator, which is a derivative itself."""
 
     def refuse(ctx, *grads):
-        raise NotImplementedError(f"{operator.name()} has no derivative: this can be differentiated once")
+        raise RuntimeError(f"{operator.name()} has no derivative: this can be differentiated once")
 
     torch.library.register_autograd(operator, refuse)
