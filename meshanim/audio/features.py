@@ -319,7 +319,7 @@ class RunningNormalization:
                 out[growing - 1] = before + (values[growing - 1] - before) / self.memory
             state = out[growing - 1]
         if growing < len(values):
-            from scipy.signal import lfilter  # slow to load, and few need it
+            from scipy.signal import lfilter  # slow to load, and only motion needs it
 
             keep = 1 - 1 / self.memory
             out[growing:] = lfilter(

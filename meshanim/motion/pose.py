@@ -73,7 +73,7 @@ def prosodic_accents(
     """
     if pitch is not None and pitch.shape != loudness.shape:
         raise ShapeError(f"loudness has {len(loudness)} values and pitch {len(pitch)}: they must be aligned")
-    from scipy.signal import find_peaks  # slow to load, and few need it
+    from scipy.signal import find_peaks  # slow to load, and only motion needs it
 
     if len(loudness) < 3:
         return np.zeros(0), np.zeros(0)
@@ -90,7 +90,7 @@ def wander(
     samples: int, deviation: float, time_constant: float, generator: np.random.Generator
 ) -> Float[np.ndarray, " samples"]:
     """Ornstein-Uhlenbeck noise at `CONTROL_RATE`, stationary from the first sample, low-passed at 0.1 s."""
-    from scipy.signal import lfilter  # slow to load, and few need it
+    from scipy.signal import lfilter  # slow to load, and only motion needs it
 
     lead = round(CONTROL_RATE)
     keep = np.exp(-1 / (CONTROL_RATE * time_constant))
